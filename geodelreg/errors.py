@@ -1,0 +1,133 @@
+"""Every refusal a user can meet, one class each.
+
+All derive from `GeodelregError`.  A message names the file, the cause and what to change;
+``exit_code`` is what the command line returns for it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from geodelreg.types import Alignment
+
+
+class GeodelregError(Exception):
+    """Base of all errors that geodelreg raises on purpose.
+
+    Parameters
+    ----------
+    cause : str
+        What is wrong, naming the file or option.
+    remedy : str, optional
+        What the user can change.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, cause: str, remedy: str = "") -> None:
+        self.cause = cause
+        self.remedy = remedy
+        super().__init__(f"{cause}. {remedy}" if remedy else cause)
+
+
+class UsageError(GeodelregError, ValueError):
+    """An option's value is impossible, or two options exclude each other."""
+
+    exit_code = 2
+
+
+class RasterNotFoundError(GeodelregError):
+    """The input file does not exist."""
+
+
+class RasterUnreadableError(GeodelregError):
+    """The input is not a raster, is truncated, or one of its blocks cannot be decoded."""
+
+
+class MissingGeoreferenceError(GeodelregError):
+    """The raster has no geotransform."""
+
+
+class UnsupportedGeoreferenceError(GeodelregError):
+    """The raster is placed by RPCs or GCPs only, or by a degenerate geotransform."""
+
+
+class MissingCrsError(GeodelregError):
+    """The raster has no coordinate reference system."""
+
+
+class CrsTransformError(GeodelregError):
+    """Points cannot be transformed between the two coordinate reference systems."""
+
+
+class BandNumberError(GeodelregError):
+    """The band asked for does not exist."""
+
+    exit_code = 2
+
+
+class BandGridError(GeodelregError):
+    """Files given as bands of one image do not share one CRS or do not overlap."""
+
+
+class NoDataError(GeodelregError):
+    """A band is constant or has no valid pixel: nothing can be matched on it."""
+
+
+class NoOverlapError(GeodelregError):
+    """The two rasters show no common ground, by their headers and by their contents."""
+
+
+class MaskError(GeodelregError):
+    """A mask cannot be read or does not cover the image."""
+
+
+class OutputExistsError(GeodelregError):
+    """The output exists and overwriting was not asked for."""
+
+
+class OutputIsInputError(GeodelregError):
+    """The output is one of the inputs."""
+
+    exit_code = 2
+
+
+class OutputUnwritableError(GeodelregError):
+    """The output cannot be written: folder missing, read-only, disk full."""
+
+
+class LossyOutputError(GeodelregError):
+    """The requested output would change pixel values."""
+
+
+class UnsafeInPlaceError(GeodelregError):
+    """The file's header cannot be replaced in place without risk."""
+
+
+class FileLockedError(GeodelregError):
+    """Another process is writing the same file."""
+
+
+class GcpFormatError(GeodelregError):
+    """A GCP file cannot be read, or its format is unknown."""
+
+
+class MissingExtraError(GeodelregError):
+    """An optional dependency is not installed."""
+
+
+class AlignmentRefusedError(GeodelregError):
+    """The evidence does not support any alignment; nothing was written.
+
+    Attributes
+    ----------
+    alignment : Alignment or None
+        All that was found out, for the report; its verdict lists the reasons.
+    """
+
+    exit_code = 3
+
+    def __init__(self, cause: str, remedy: str = "", alignment: Alignment | None = None) -> None:
+        super().__init__(cause, remedy)
+        self.alignment = alignment

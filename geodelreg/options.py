@@ -1,0 +1,142 @@
+"""Frozen, validated options.  Each knob is documented here once; the command line reads it from here.
+
+This module imports nothing heavy: ``geodelreg --help`` loads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from geodelreg.errors import UsageError
+
+METHODS = ("delaunay", "zhang2013", "sift")
+MODELS = ("auto", "shift", "scale", "similarity", "affine")
+GEOREFS = ("geotransform", "gcps")
+WARP_GRIDS = ("ms", "pan")
+RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
+
+
+def _knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
+    return field(default=default, metadata={"help": help_text, "choices": choices})
+
+
+def knob_help(options: type, name: str) -> str:
+    """Help text of one knob of an options class."""
+    return str({f.name: f for f in fields(options)}[name].metadata["help"])
+
+
+def _check_choice(options: object, name: str) -> None:
+    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    choices, value = spec.metadata["choices"], getattr(options, name)
+    if value not in choices:
+        raise UsageError(f"{name} = {value!r} is unknown", f"Use one of: {', '.join(choices)}.")
+
+
+def _check_range(options: object, name: str, low: float, high: float) -> None:
+    value = getattr(options, name)
+    if value is not None and not low <= value <= high:
+        raise UsageError(f"{name} = {value} is out of range", f"Use {low:g} to {high:g}.")
+
+
+@dataclass(frozen=True, slots=True)
+class AlignOptions:
+    """How the correction is found."""
+
+    method: str = _knob(
+        "delaunay",
+        "delaunay: coarse to fine with Delaunay filtering and sub-pixel refinement; zhang2013: the "
+        "paper's method, step by step; sift: plain SIFT and least squares, as a baseline.",
+        METHODS,
+    )
+    model: str = _knob(
+        "auto",
+        "Transformation of the header. auto takes the simplest that held-out points do not reject, "
+        "north-up ones (shift, scale) before rotated ones (similarity, affine).",
+        MODELS,
+    )
+    band: int | None = _knob(
+        None,
+        "MS band to match on, from 1; auto weights the bands so that together they look like PAN.",
+    )
+    pan_band: int = _knob(1, "Band of the PAN (reference) raster to match on, from 1.")
+    search_radius_px: float = _knob(
+        512.0,
+        "How far off, in PAN pixels, the header may be for the first search; when that finds nothing, "
+        "both rasters are searched whole.",
+    )
+    tolerance_px: float = _knob(
+        0.02,
+        "A correction that moves no pixel by more than this many PAN pixels, or by no more than its own uncertainty, "
+        "is not applied: verdict already_aligned.",
+    )
+    ratio: float = _knob(0.8, "Lowe's limit on nearest over second nearest descriptor distance.")
+    max_keypoints: int = _knob(
+        6000, "Keypoints kept per image, strongest first, spread over the image."
+    )
+    max_shift_px: float | None = _knob(
+        None, "Refuse a correction that shifts the centre by more PAN pixels than this."
+    )
+    max_rotation_deg: float | None = _knob(
+        None, "Refuse a correction that rotates by more degrees than this."
+    )
+    max_scale: float | None = _knob(
+        None, "Refuse a correction that scales by more than this factor (or by less than its inverse)."
+    )
+    threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
+    seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
+
+    def __post_init__(self) -> None:
+        _check_choice(self, "method")
+        _check_choice(self, "model")
+        _check_range(self, "band", 1, 65535)
+        _check_range(self, "pan_band", 1, 65535)
+        _check_range(self, "search_radius_px", 0, 1e7)
+        _check_range(self, "tolerance_px", 0, 1e3)
+        _check_range(self, "ratio", 0.1, 1.0)
+        _check_range(self, "max_keypoints", 16, 100_000)
+        _check_range(self, "max_shift_px", 0, 1e9)
+        _check_range(self, "max_rotation_deg", 0, 180)
+        _check_range(self, "max_scale", 1, 1e3)
+        _check_range(self, "threads", 0, 1024)
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """How the corrected raster is written."""
+
+    overwrite: bool = _knob(False, "Replace existing outputs; without it they are an error.")
+    driver: str | None = _knob(
+        None, "GDAL format of OUT, guessed from its extension when not given."
+    )
+    creation_options: tuple[str, ...] = _knob(
+        (), "Creation option of the format, KEY=VALUE, as in GDAL; may be repeated."
+    )
+    georef: str = _knob(
+        "geotransform",
+        "geotransform: OUT carries the corrected geotransform; gcps: OUT carries the ground control "
+        "points instead (a GeoTIFF holds one or the other).",
+        GEOREFS,
+    )
+    strip_rpc: bool = _knob(
+        False, "Drop RPC tags, which would contradict the corrected geotransform."
+    )
+    warp: bool = _knob(
+        False,
+        "Resample onto a north-up grid instead of correcting the header, for software that rejects "
+        "rotated geotransforms.",
+    )
+    warp_grid: str = _knob(
+        "ms", "Grid of --warp: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
+    )
+    resampling: str = _knob("cubic", "Resampling of --warp.", RESAMPLINGS)
+
+    def __post_init__(self) -> None:
+        _check_choice(self, "georef")
+        _check_choice(self, "warp_grid")
+        _check_choice(self, "resampling")
+        for option in self.creation_options:
+            if "=" not in option:
+                raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+        if self.warp and self.georef == "gcps":
+            raise UsageError("--warp and --georef gcps exclude each other", "Drop one of them.")
