@@ -233,6 +233,19 @@ class Correction:
         return self.map_transform @ transform
 
 
+@dataclass(frozen=True, slots=True)
+class Gcp:
+    """A ground control point: MS pixel (outer-corner convention) ↔ map coordinates in the MS CRS."""
+
+    id: str
+    column: float
+    row: float
+    x: float
+    y: float
+    z: float = 0.0
+    info: str = ""
+
+
 class Outcome(Enum):
     """What an alignment ended as."""
 
