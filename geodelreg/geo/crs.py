@@ -1,0 +1,204 @@
+"""Exact change of map coordinates between CRSs, through pyproj."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geodelreg.errors import CrsTransformError
+from geodelreg.geo.affine import affine_matrix, apply_affine
+from geodelreg.types import FloatArray, Grid
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class CrsOperation:
+    """The pyproj operation that carries map points from one CRS to the other.
+
+    Attributes
+    ----------
+    description : str
+        PROJ's description with its accuracy; "" for identical CRSs.
+    accuracy_m : float
+        NaN when PROJ does not know it.
+    warning : str
+        Non-empty when a better operation needs a grid that is not installed.
+    """
+
+    description: str = ""
+    accuracy_m: float = float("nan")
+    warning: str = ""
+
+
+@lru_cache(maxsize=16)
+def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOperation]:
+    if from_wkt == to_wkt:
+        return None, CrsOperation()
+    from pyproj import CRS
+    from pyproj.exceptions import ProjError
+    from pyproj.transformer import TransformerGroup
+
+    try:
+        source, target = CRS.from_wkt(from_wkt), CRS.from_wkt(to_wkt)
+        if source.equals(target, ignore_axis_order=True):
+            return None, CrsOperation()
+        group = TransformerGroup(source, target, always_xy=True)
+        transformer = group.transformers[0]
+    except (ProjError, IndexError) as error:
+        raise CrsTransformError(
+            f"no transformation between the coordinate reference systems is known ({error})",
+            "Reproject one raster into the other's CRS, or correct its CRS definition.",
+        ) from error
+    accuracy = float(transformer.accuracy)
+    accuracy = accuracy if accuracy >= 0 else float("nan")
+    warning = ""
+    if not group.best_available and group.unavailable_operations:
+        best = group.unavailable_operations[0]
+        grids = ", ".join(grid.short_name for grid in best.grids) or "a grid"
+        warning = (
+            f"the best operation between the CRSs ({best.name}) needs {grids}, which PROJ does not "
+            f"find; used {transformer.description!r} instead"
+        )
+    text = transformer.description
+    if accuracy == accuracy:
+        text = f"{text} (accuracy {accuracy:g} m)"
+    return transformer, CrsOperation(text, accuracy, warning)
+
+
+def crs_operation(from_wkt: str, to_wkt: str) -> CrsOperation:
+    """Operation that `map_points` uses for this pair of CRSs.
+
+    Raises
+    ------
+    CrsTransformError
+        If PROJ knows none.
+    """
+    return _operation(from_wkt, to_wkt)[1]
+
+
+def map_points(xy: FloatArray, from_wkt: str, to_wkt: str) -> FloatArray:
+    """Transform map coordinates.
+
+    Parameters
+    ----------
+    xy : (..., 2) float64
+        (easting, northing) or (longitude, latitude).
+    from_wkt, to_wkt : str
+        WKT of the two CRSs.
+
+    Returns
+    -------
+    (..., 2) float64
+        NaN where a point has no image in the target CRS.
+
+    Raises
+    ------
+    CrsTransformError
+        If PROJ knows no operation.
+    """
+    transformer = _operation(from_wkt, to_wkt)[0]
+    points = np.asarray(xy, dtype=np.float64)
+    if transformer is None:
+        return points.copy()
+    x, y = transformer.transform(points[..., 0].ravel(), points[..., 1].ravel())
+    out = np.stack([x, y], axis=-1).reshape(points.shape)
+    out[~np.isfinite(out)] = np.nan
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeaderMapping:
+    """Source pixels to reference pixels, as the two headers claim.
+
+    Attributes
+    ----------
+    source, reference : Grid
+    operation : CrsOperation
+    matrix : (2, 3) float64 or None
+        The mapping when it is affine (equal CRSs), else None.
+    """
+
+    source: Grid
+    reference: Grid
+    operation: CrsOperation
+    matrix: FloatArray | None
+
+    def forward(self, source_px: FloatArray) -> FloatArray:
+        """(..., 2) source pixels to (..., 2) reference pixels; NaN where undefined."""
+        return _through(source_px, self.source, self.reference)
+
+    def inverse(self, reference_px: FloatArray) -> FloatArray:
+        """(..., 2) reference pixels to (..., 2) source pixels; NaN where undefined."""
+        return _through(reference_px, self.reference, self.source)
+
+
+def _through(px: FloatArray, start: Grid, end: Grid) -> FloatArray:
+    ground = map_points(apply_affine(start.transform, px), start.crs_wkt, end.crs_wkt)
+    return apply_affine(~end.transform, ground)
+
+
+def header_mapping(source: Grid, reference: Grid) -> HeaderMapping:
+    """Mapping between two rasters' pixels through their geotransforms and CRSs."""
+    transformer, operation = _operation(source.crs_wkt, reference.crs_wkt)
+    matrix = None
+    if transformer is None:
+        matrix = affine_matrix(~reference.transform @ source.transform)
+    elif operation.warning:
+        logger.warning(operation.warning)
+    return HeaderMapping(source, reference, operation, matrix)
+
+
+PointMapping = Callable[[FloatArray], FloatArray]
+
+
+def linearise(mapping: PointMapping, at: FloatArray, step_px: float = 4.0) -> FloatArray:
+    """Local affine of a smooth mapping by central differences.
+
+    Parameters
+    ----------
+    mapping : callable
+        (..., 2) to (..., 2).
+    at : (N, 2) float64
+    step_px : float
+        Half width of the differences.
+
+    Returns
+    -------
+    (N, 2, 3) float64
+        ``mapping(at + d) ≈ A[:, :, :2] @ d + A[:, :, 2]``.
+    """
+    right, down = np.array([step_px, 0.0]), np.array([0.0, step_px])
+    stack = np.stack([at + right, at - right, at + down, at - down, at])
+    image = mapping(stack)
+    out = np.empty((len(at), 2, 3))
+    out[:, :, 0] = (image[0] - image[1]) / (2 * step_px)
+    out[:, :, 1] = (image[2] - image[3]) / (2 * step_px)
+    out[:, :, 2] = image[4]
+    return out
+
+
+def fitted_affine(mapping: PointMapping, shape: tuple[int, int]) -> FloatArray:
+    """(2, 3) affine closest to `mapping` over a raster of `shape` (height, width), least squares."""
+    rows, columns = np.meshgrid(
+        np.linspace(0, shape[0], 5), np.linspace(0, shape[1], 5), indexing="ij"
+    )
+    xy = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    image = mapping(xy)
+    good = np.isfinite(image).all(axis=1)
+    if good.sum() < 3:
+        raise CrsTransformError(
+            "the source raster's corners cannot be transformed into the reference's CRS",
+            "Check both CRS definitions and geotransforms.",
+        )
+    design = np.column_stack([xy[good], np.ones(int(good.sum()))])
+    return np.linalg.lstsq(design, image[good], rcond=None)[0].T
+
