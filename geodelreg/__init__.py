@@ -1,0 +1,54 @@
+"""Aligns a multispectral raster to a panchromatic one by correcting its georeferencing.
+
+The public names are loaded when first used, so importing this package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from geodelreg import errors
+    from geodelreg.api import align, export_gcps, revert, write, write_in_place
+    from geodelreg.options import AlignOptions, WriteOptions
+    from geodelreg.types import Alignment
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AlignOptions",
+    "Alignment",
+    "WriteOptions",
+    "__version__",
+    "align",
+    "errors",
+    "export_gcps",
+    "revert",
+    "write",
+    "write_in_place",
+]
+
+_HOMES = {
+    "AlignOptions": "geodelreg.options",
+    "Alignment": "geodelreg.types",
+    "WriteOptions": "geodelreg.options",
+    "align": "geodelreg.api",
+    "export_gcps": "geodelreg.api",
+    "revert": "geodelreg.api",
+    "write": "geodelreg.api",
+    "write_in_place": "geodelreg.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name on first use (PEP 562)."""
+    if name == "errors":
+        return import_module("geodelreg.errors")
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
