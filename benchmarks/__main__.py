@@ -1,0 +1,28 @@
+"""``python -m benchmarks COMMAND``: see benchmarks/README.md."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+COMMANDS = {
+    "scenes": ("benchmarks.scenes", "write the scenes with known truth"),
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Dispatch to the module of a command."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, (_, summary) in COMMANDS.items():
+        commands.add_parser(name, help=summary, add_help=False)
+    known, rest = parser.parse_known_args(argv)
+    module = importlib.import_module(COMMANDS[known.command][0])
+    command = argparse.ArgumentParser(prog=f"python -m benchmarks {known.command}")
+    module.add_arguments(command)
+    return int(module.run(command.parse_args(rest)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
