@@ -1,0 +1,58 @@
+"""GDAL's settings while a raster is open: a small block cache, errors as exceptions, no chatter."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+CACHE_BYTES = 64_000_000
+"""GDAL's own default is 5 % of the RAM; 64 MB loses nothing when pieces are read block by block."""
+
+
+class _SharedCacheLimit:
+    """GDAL has one cache for the process: the first user bounds it, the last one restores it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+        self._before = 0
+
+    def acquire(self) -> None:
+        from rasterio.env import get_gdal_config, set_gdal_config
+
+        with self._lock:
+            if self._users == 0:
+                self._before = int(get_gdal_config("GDAL_CACHEMAX"))
+                set_gdal_config("GDAL_CACHEMAX", min(self._before, CACHE_BYTES))
+            self._users += 1
+
+    def release(self) -> None:
+        from rasterio.env import set_gdal_config
+
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                set_gdal_config("GDAL_CACHEMAX", self._before)
+
+
+_cache_limit = _SharedCacheLimit()
+
+
+@contextmanager
+def bounded_cache() -> Iterator[None]:
+    """Keep GDAL's block cache at `CACHE_BYTES` or what the user set, if less; then restore it."""
+    _cache_limit.acquire()
+    try:
+        yield
+    finally:
+        _cache_limit.release()
+
+
+@contextmanager
+def gdal_calls() -> Iterator[None]:
+    """Wrap calls into GDAL: its messages go to the ``rasterio`` logger of this thread."""
+    import rasterio
+
+    with rasterio.Env(GTIFF_IMPLICIT_JPEG_OVR=False, GDAL_NUM_THREADS="ALL_CPUS"):
+        yield

@@ -1,0 +1,183 @@
+"""Opening raster files: every way a file can be unfit has its own error and remedy."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from affine import Affine
+
+from geodelreg.errors import (
+    MissingCrsError,
+    MissingGeoreferenceError,
+    RasterNotFoundError,
+    RasterUnreadableError,
+    UnsupportedGeoreferenceError,
+)
+from geodelreg.image.environment import gdal_calls
+from geodelreg.types import Grid
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+logger = logging.getLogger(__name__)
+
+_PLAUSIBLE_SIDE = 1_000_000
+# the densest lossless codecs of TIFF do not reach this
+_PIXELS_PER_BYTE = 20_000
+
+
+def is_local(path: str) -> bool:
+    """Whether `path` names a file of the file system, not a URL or one of GDAL's own schemes."""
+    return not path.startswith("/vsi") and "://" not in path and not _is_subdataset(path)
+
+
+def _is_subdataset(path: str) -> bool:
+    head, colon, _ = path.partition(":")
+    return bool(colon) and len(head) > 1 and not Path(path).exists()
+
+
+def open_dataset(path: str, overview_level: int | None = None) -> DatasetReader:
+    """Open a raster file with GDAL and check that it holds real pixels.
+
+    Raises
+    ------
+    RasterNotFoundError, RasterUnreadableError
+    """
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    if is_local(path) and not Path(path).exists():
+        raise RasterNotFoundError(f"{path} does not exist", "Check the path.")
+    options = {} if overview_level is None else {"overview_level": overview_level}
+    try:
+        with gdal_calls(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            dataset = rasterio.open(path, **options)
+    except (RasterioError, OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    try:
+        _check_pixels(path, dataset)
+    except BaseException:
+        dataset.close()
+        raise
+    return dataset
+
+
+def _unreadable(path: str, error: Exception) -> RasterUnreadableError | RasterNotFoundError:
+    reason = " ".join(str(error).split())
+    if not is_local(path):
+        return RasterUnreadableError(
+            f"{path} cannot be opened ({reason})", "Check the address and the access to it."
+        )
+    if Path(path).is_dir():
+        return RasterUnreadableError(
+            f"{path} is a folder", "Name a raster file, or one file per band."
+        )
+    if Path(path).stat().st_size == 0:
+        return RasterUnreadableError(f"{path} is empty", "Copy or download it again.")
+    return RasterUnreadableError(
+        f"{path} is not a raster that GDAL can open ({reason})",
+        "Give a GeoTIFF or another raster format that gdalinfo reads.",
+    )
+
+
+def _check_pixels(path: str, dataset: DatasetReader) -> None:
+    if dataset.count == 0 and dataset.subdatasets:
+        listed = ", ".join(dataset.subdatasets[:4])
+        more = ", …" if len(dataset.subdatasets) > 4 else ""
+        raise RasterUnreadableError(
+            f"{path} is a container of {len(dataset.subdatasets)} rasters, not a raster",
+            f"Name one of them: {listed}{more}.",
+        )
+    if dataset.count == 0 or dataset.width < 1 or dataset.height < 1:
+        raise RasterUnreadableError(f"{path} holds no pixels", "Give a raster with image bands.")
+    for number, dtype in enumerate(dataset.dtypes, start=1):
+        if dtype.startswith("complex"):
+            raise RasterUnreadableError(
+                f"band {number} of {path} holds complex numbers",
+                "Write its amplitude to a new file first, for example with gdal_calc.py.",
+            )
+    pixels = dataset.width * dataset.height
+    if (
+        max(dataset.width, dataset.height) > _PLAUSIBLE_SIDE
+        and dataset.driver == "GTiff"
+        and is_local(path)
+        and pixels > _PIXELS_PER_BYTE * Path(path).stat().st_size
+    ):
+        raise RasterUnreadableError(
+            f"the header of {path} claims {dataset.width} × {dataset.height} pixels, which its "
+            f"{Path(path).stat().st_size} bytes cannot hold",
+            "The file is damaged: copy or download it again.",
+        )
+
+
+def dataset_grid(path: str, dataset: DatasetReader) -> Grid:
+    """Grid of an open raster.
+
+    Raises
+    ------
+    MissingGeoreferenceError, UnsupportedGeoreferenceError, MissingCrsError
+    """
+    with gdal_calls(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        transform, crs = dataset.transform, dataset.crs
+        gcps, _ = dataset.gcps
+        rpcs = dataset.rpcs
+    _check_transform(path, transform, bool(gcps), rpcs is not None)
+    if not crs:
+        raise MissingCrsError(
+            f"{path} has no coordinate reference system",
+            "Assign the right one: gdal_edit.py -a_srs EPSG:… FILE (or rio edit-info --crs).",
+        )
+    return Grid(transform, (dataset.height, dataset.width), _wkt2(crs))
+
+
+def _check_transform(path: str, transform: Affine, has_gcps: bool, has_rpcs: bool) -> None:
+    values = tuple(transform)[:6]
+    if not all(math.isfinite(value) for value in values):
+        raise UnsupportedGeoreferenceError(
+            f"the geotransform of {path} is not finite: {values}",
+            "Assign a valid one: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
+        )
+    if transform == Affine.identity():
+        _raise_without_geotransform(path, has_gcps, has_rpcs)
+    across = math.hypot(transform.a, transform.d)
+    down = math.hypot(transform.b, transform.e)
+    if abs(transform.determinant) <= 1e-9 * across * down or min(across, down) == 0:
+        raise UnsupportedGeoreferenceError(
+            f"the geotransform of {path} is degenerate: its pixels have no area {values}",
+            "Assign a valid one: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
+        )
+
+
+def _raise_without_geotransform(path: str, has_gcps: bool, has_rpcs: bool) -> None:
+    if has_gcps:
+        raise UnsupportedGeoreferenceError(
+            f"{path} is placed by ground control points only; there is no geotransform to correct",
+            "Turn them into a geotransform first: gdalwarp FILE OUT.tif.",
+        )
+    if has_rpcs:
+        raise UnsupportedGeoreferenceError(
+            f"{path} is placed by RPCs only; there is no geotransform to correct",
+            "Orthorectify it first: gdalwarp -rpc -to RPC_DEM=DEM.tif FILE OUT.tif.",
+        )
+    raise MissingGeoreferenceError(
+        f"{path} has no geotransform",
+        "Give it a rough one first: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE, or a world file.",
+    )
+
+
+def _wkt2(crs: object) -> str:
+    from rasterio.enums import WktVersion
+    from rasterio.errors import CRSError
+
+    with gdal_calls():
+        try:
+            return str(crs.to_wkt(version=WktVersion.WKT2_2019))  # type: ignore[attr-defined]
+        except CRSError:
+            logger.debug("no WKT2 form of the CRS; WKT1 is used", exc_info=True)
+            return str(crs.to_wkt())  # type: ignore[attr-defined]

@@ -1,0 +1,441 @@
+"""Windows of one image, in one file or in one file per band, full size or averaged down."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geodelreg.errors import (
+    BandGridError,
+    BandNumberError,
+    NoDataError,
+    RasterUnreadableError,
+    UsageError,
+)
+from geodelreg.geo.grid import decimated_grid
+from geodelreg.image.decimate import BoxAverage
+from geodelreg.image.environment import bounded_cache, gdal_calls
+from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.image.validity import alpha_bands, differs_from_nodata, has_mask_band
+from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from rasterio.io import DatasetReader
+
+logger = logging.getLogger(__name__)
+
+_PIECE_PIXELS = 4_000_000
+"""Pixels (of all bands together) that a decimated read holds at a time."""
+
+_EXACT_PIXELS = 16_000_000
+"""Windows up to this size are averaged from full resolution, whatever the overviews hold."""
+
+_LARGE_BLOCK_BYTES = 64_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class _FileBand:
+    """Where a band of the image is stored."""
+
+    file: int
+    number: int
+    name: str
+
+
+class _File:
+    """One open raster file and, opened on demand, its overviews."""
+
+    def __init__(self, path: str, stack: ExitStack) -> None:
+        self.path = path
+        self.dataset = stack.enter_context(open_dataset(path))
+        self.grid = dataset_grid(path, self.dataset)
+        self._stack = stack
+        self._levels: dict[int, DatasetReader] = {}
+        self._alpha = alpha_bands(self.dataset)
+        self.image_bands = tuple(
+            n for n in range(1, self.dataset.count + 1) if n not in self._alpha
+        )
+
+    def level(self, level: int | None) -> DatasetReader:
+        if level is None:
+            return self.dataset
+        if level not in self._levels:
+            self._levels[level] = self._stack.enter_context(open_dataset(self.path, level))
+        return self._levels[level]
+
+    def overview_factors(self) -> list[float]:
+        """True ratios of sizes, one per overview level that all image bands have."""
+        counts = [len(self.dataset.overviews(n)) for n in self.image_bands]
+        factors = []
+        for level in range(min(counts, default=0)):
+            overview = self.level(level)
+            factors.append(
+                min(self.dataset.width / overview.width, self.dataset.height / overview.height)
+            )
+        return factors
+
+    def pixels(
+        self, numbers: Sequence[int], window: Window, level: int | None = None
+    ) -> tuple[Float32Array, BoolArray]:
+        """Pixels (B, h, w) float32, 0 where invalid, and their validity (B, h, w) bool."""
+        from rasterio.errors import RasterioError
+
+        dataset = self.level(level)
+        bottom, right = window.row + window.height, window.column + window.width
+        area = ((window.row, bottom), (window.column, right))
+        try:
+            with gdal_calls():
+                raw = dataset.read(list(numbers), window=area)
+                masks = [self._mask(dataset, n, area) for n in numbers]
+        except (RasterioError, OSError, MemoryError, ValueError) as error:
+            raise RasterUnreadableError(
+                f"{self.path}: pixels of columns {window.column}–{right}, "
+                f"rows {window.row}–{bottom} cannot be decoded "
+                f"({' '.join(str(error.__cause__ or error).split())})",
+                "The file is truncated or damaged: copy or download it again.",
+            ) from error
+        with np.errstate(over="ignore", invalid="ignore"):
+            data = raw.astype(np.float32)
+        valid = np.isfinite(data) if raw.dtype.kind == "f" else np.ones(data.shape, dtype=np.bool_)
+        for plane, number in enumerate(numbers):
+            differs = differs_from_nodata(raw[plane], dataset.nodatavals[number - 1])
+            for mask in (differs, *masks[plane]):
+                if mask is not None:
+                    valid[plane] &= mask
+        if not valid.all():
+            data[~valid] = 0
+        return data, valid
+
+    def _mask(
+        self, dataset: DatasetReader, number: int, area: tuple[tuple[int, int], tuple[int, int]]
+    ) -> list[BoolArray]:
+        masks = [dataset.read(n, window=area) != 0 for n in self._alpha]
+        if has_mask_band(dataset, number):
+            masks.append(dataset.read_masks(number, window=area) != 0)
+        return masks
+
+
+class RasterReader:
+    """An image open for reading; use it as a context manager.  Safe to share between threads.
+
+    Attributes
+    ----------
+    paths : tuple of str
+        Files that hold the bands.
+    other_paths : tuple of str
+        Files given with them that lie on another grid: a correction applies to them, too.
+    """
+
+    def __init__(self, paths: Sequence[str]) -> None:
+        if not paths:
+            raise UsageError("no raster file was named", "Give at least one.")
+        self._lock = threading.Lock()
+        with ExitStack() as stack:
+            stack.enter_context(bounded_cache())
+            files = [_File(path, stack) for path in paths]
+            self._files = _on_the_common_grid(files)
+            self._stack = stack.pop_all()
+        self.paths = tuple(file.path for file in self._files)
+        self.other_paths = tuple(file.path for file in files if file not in self._files)
+        self._bands = _list_bands(self._files)
+        self._decimations = self._common_decimations()
+
+    def __enter__(self) -> RasterReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        with self._lock:
+            self._stack.close()
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the full raster."""
+        return self._files[0].grid
+
+    @property
+    def name(self) -> str:
+        """File name, for messages; that of the first file and the number of the others."""
+        name = Path(self.paths[0]).name
+        return name if len(self.paths) == 1 else f"{name} and {len(self.paths) - 1} more"
+
+    @property
+    def band_names(self) -> tuple[str, ...]:
+        """One name per image band (alpha is not one); band numbers are positions in it, from 1."""
+        return tuple(band.name for band in self._bands)
+
+    @property
+    def dtypes(self) -> tuple[str, ...]:
+        """Pixel type of each band, as stored."""
+        return tuple(
+            str(self._files[band.file].dataset.dtypes[band.number - 1]) for band in self._bands
+        )
+
+    @property
+    def decimations(self) -> tuple[float, ...]:
+        """Factors at which a decimated read is cheap: 1.0, then the overviews'."""
+        return self._decimations
+
+    @property
+    def block_note(self) -> str:
+        """Says so when one block is too large for the file to be read in pieces; else empty."""
+        for file in self._files:
+            height, width = file.dataset.block_shapes[0]
+            planes = file.dataset.count if file.dataset.profile.get("interleave") == "pixel" else 1
+            size = height * width * planes * np.dtype(file.dataset.dtypes[0]).itemsize
+            if size > _LARGE_BLOCK_BYTES:
+                return (
+                    f"{Path(file.path).name} is stored in blocks of {width} × {height} pixels "
+                    f"({size / 1e6:.0f} MB), each of which can only be read whole; "
+                    "a tiled copy needs less memory"
+                )
+        return ""
+
+    @property
+    def is_single_block(self) -> bool:
+        """True when windows cannot be read in pieces."""
+        return bool(self.block_note)
+
+    def read(
+        self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
+    ) -> list[Band]:
+        """Read a window.
+
+        Parameters
+        ----------
+        bands : sequence of int
+            Positions in `band_names`, from 1.
+        window : Window
+            Inside the raster.
+        shape : tuple of int, optional
+            ``(height, width)`` to average down to, not above the window's.  A pixel is the
+            average of its valid part and valid when that is half of it.
+
+        Returns
+        -------
+        list of Band
+            In the order of `bands`, each with the grid of its pixels.
+
+        Raises
+        ------
+        BandNumberError
+        RasterUnreadableError
+            If a block cannot be decoded.
+        ValueError
+            If `window` is not inside the raster, or `shape` larger than it.
+        """
+        for number in bands:
+            check_band(self, number)
+        self._check_window(window, shape)
+        grid = decimated_grid(self.grid, window, shape)
+        wanted = [self._bands[number - 1] for number in bands]
+        planes: dict[_FileBand, tuple[Float32Array, BoolArray]] = {}
+        with self._lock:
+            for index, group in groupby(sorted(set(wanted), key=_storage), lambda b: b.file):
+                stored = list(group)
+                numbers = [band.number for band in stored]
+                data, valid = self._read_file(self._files[index], numbers, window, grid.shape)
+                planes.update(zip(stored, zip(data, valid, strict=True), strict=True))
+        return [Band(*planes[band], grid, band.name) for band in wanted]
+
+    def _check_window(self, window: Window, shape: tuple[int, int] | None) -> None:
+        height, width = self.grid.shape
+        if (
+            min(window.column, window.row) < 0
+            or min(window.width, window.height) < 1
+            or window.column + window.width > width
+            or window.row + window.height > height
+        ):
+            raise ValueError(f"{window} is not inside the {width} × {height} pixels of {self.name}")
+        if shape is not None and not (
+            1 <= shape[0] <= window.height and 1 <= shape[1] <= window.width
+        ):
+            raise ValueError(f"{window} cannot be averaged down to {shape} (height, width)")
+
+    def _read_file(
+        self, file: _File, numbers: list[int], window: Window, shape: tuple[int, int]
+    ) -> tuple[Float32Array, BoolArray]:
+        if shape == (window.height, window.width):
+            return file.pixels(numbers, window)
+        level = self._best_level(window, shape)
+        dataset = file.level(level)
+        scale = (dataset.width / file.dataset.width, dataset.height / file.dataset.height)
+        origin = (window.column * scale[0], window.row * scale[1])
+        size = (window.width * scale[0], window.height * scale[1])
+        average = BoxAverage(len(numbers), shape, origin, size)
+        for piece in _pieces(dataset, origin, size, len(numbers)):
+            average.add(*file.pixels(numbers, piece, level), piece.column, piece.row)
+        return average.result()
+
+    def _best_level(self, window: Window, shape: tuple[int, int]) -> int | None:
+        if window.width * window.height <= _EXACT_PIXELS:
+            return None
+        ratio = min(window.width / shape[1], window.height / shape[0]) * (1 + 1e-6)
+        fitting = [i for i, factor in enumerate(self._decimations[1:]) if factor <= ratio]
+        return fitting[-1] if fitting else None
+
+    def _common_decimations(self) -> tuple[float, ...]:
+        factors = [file.overview_factors() for file in self._files]
+        shared = min(factors, key=len)
+        same = all(np.allclose(other[: len(shared)], shared) for other in factors)
+        return (1.0, *(shared if same else ()))
+
+
+def _storage(band: _FileBand) -> tuple[int, int]:
+    return band.file, band.number
+
+
+def _pieces(
+    dataset: DatasetReader, origin: tuple[float, float], size: tuple[float, float], bands: int
+) -> list[Window]:
+    """Pieces of whole blocks that cover a window, each of about `_PIECE_PIXELS`."""
+    left, top = int(origin[0] + 1e-6), int(origin[1] + 1e-6)
+    right = min(dataset.width, int(np.ceil(origin[0] + size[0] - 1e-6)))
+    bottom = min(dataset.height, int(np.ceil(origin[1] + size[1] - 1e-6)))
+    block_height, block_width = (int(side) for side in dataset.block_shapes[0])
+    pixels = max(_PIECE_PIXELS // bands, 1)
+    rows = max(pixels // (right - left) // block_height, 1) * block_height
+    rows = min(rows, max(pixels // min(right - left, block_width), 1))
+    columns = max(pixels // rows // block_width, 1) * block_width
+    columns = min(columns, max(pixels // rows, 1))
+    return [
+        Window(x0, y0, x1 - x0, y1 - y0)
+        for y0, y1 in _cuts(top, bottom, rows)
+        for x0, x1 in _cuts(left, right, columns)
+    ]
+
+
+def _cuts(start: int, stop: int, step: int) -> list[tuple[int, int]]:
+    """Cut a range at the multiples of `step`."""
+    inner = range((start // step + 1) * step, stop, step)
+    edges = [start, *inner, stop]
+    return list(pairwise(edges))
+
+
+def _on_the_common_grid(files: list[_File]) -> list[_File]:
+    """Files on the grid that most of them share; on a tie the finest."""
+    from rasterio.crs import CRS
+
+    first = files[0]
+    with gdal_calls():
+        crs = CRS.from_wkt(first.grid.crs_wkt)
+        for file in files[1:]:
+            if file.grid.crs_wkt != first.grid.crs_wkt and CRS.from_wkt(file.grid.crs_wkt) != crs:
+                raise BandGridError(
+                    f"{first.path} and {file.path} have different coordinate reference systems",
+                    "Bands of one image share one; align images with different ones separately.",
+                )
+    groups: list[list[_File]] = []
+    for file in files:
+        group = next((g for g in groups if _same_grid(g[0].grid, file.grid)), None)
+        if group is None:
+            groups.append([file])
+        else:
+            group.append(file)
+    return max(groups, key=lambda g: (len(g), -abs(g[0].grid.transform.determinant)))
+
+
+def _same_grid(one: Grid, other: Grid) -> bool:
+    """Same size, and no corner apart by more than a thousandth of a pixel."""
+    if one.shape != other.shape:
+        return False
+    height, width = one.shape
+    offset = ~one.transform @ other.transform
+    corners = ((0, 0), (width, 0), (0, height), (width, height))
+    return all(np.hypot(*np.subtract(offset @ corner, corner)) <= 1e-3 for corner in corners)
+
+
+def _list_bands(files: list[_File]) -> list[_FileBand]:
+    bands = []
+    for index, file in enumerate(files):
+        for number in file.image_bands:
+            name = file.dataset.descriptions[number - 1] or f"band {number}"
+            if len(files) > 1:
+                stem = Path(file.path).stem
+                name = stem if len(file.image_bands) == 1 else f"{stem} {name}"
+            bands.append(_FileBand(index, number, name))
+    return bands
+
+
+def open_raster(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> RasterReader:
+    """Open an image for reading: one file, or one file per band.
+
+    Of several files, those on the grid that most of them share hold the bands (on a tie the
+    finest grid); the others are listed in `RasterReader.other_paths`.
+
+    Parameters
+    ----------
+    path : path or sequence of paths
+        Anything GDAL opens; URLs and ``/vsi…`` paths are passed to it as they are.
+
+    Returns
+    -------
+    RasterReader
+        A context manager.
+
+    Raises
+    ------
+    RasterNotFoundError, RasterUnreadableError
+        If a file is missing, or not a raster with real pixels.
+    MissingGeoreferenceError, UnsupportedGeoreferenceError, MissingCrsError
+        If a file does not say where it lies, or not through a geotransform.
+    BandGridError
+        If the files' CRSs differ.
+    """
+    paths = [path] if isinstance(path, str) or hasattr(path, "__fspath__") else list(path)
+    return RasterReader([str(one) for one in paths])
+
+
+def check_band(reader: RasterReader, number: int) -> None:
+    """Make sure that a band exists.
+
+    Raises
+    ------
+    BandNumberError
+    """
+    count = len(reader.band_names)
+    if not 1 <= number <= count:
+        raise BandNumberError(
+            f"{reader.name} has no band {number}",
+            f"Use 1 to {count}." if count > 1 else "It has band 1 only.",
+        )
+
+
+def check_texture(band: Band) -> None:
+    """Make sure that there is something to match.
+
+    Raises
+    ------
+    NoDataError
+        If no pixel is valid, or all valid ones have the same value.
+    """
+    values = band.data[band.valid]
+    if values.size == 0:
+        raise NoDataError(
+            f"{band.name} has no valid pixel in the area that was read",
+            "Choose another band, or check the no-data value and the mask.",
+        )
+    if values.min() == values.max():
+        raise NoDataError(
+            f"{band.name} has the same value ({values[0]:g}) everywhere in the area that was read",
+            "Choose another band.",
+        )

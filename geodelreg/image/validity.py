@@ -1,0 +1,61 @@
+"""Which pixels of a raster are good: no-data values, masks, alpha and NaN."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.types import BoolArray
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+# GDAL compares floating-point no-data values with this relative tolerance
+_FLOAT_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
+
+
+def alpha_bands(dataset: DatasetReader) -> tuple[int, ...]:
+    """1-based numbers of the bands that are transparency, not image."""
+    from rasterio.enums import ColorInterp
+
+    return tuple(
+        number
+        for number, meaning in enumerate(dataset.colorinterp, start=1)
+        if meaning == ColorInterp.alpha
+    )
+
+
+def has_mask_band(dataset: DatasetReader, band: int) -> bool:
+    """Whether the file has a mask of its own (internal or ``.msk``) for this band."""
+    from rasterio.enums import MaskFlags
+
+    flags = dataset.mask_flag_enums[band - 1]
+    return not {MaskFlags.all_valid, MaskFlags.nodata, MaskFlags.alpha} & set(flags)
+
+
+def differs_from_nodata(data: NDArray[Any], nodata: float | None) -> BoolArray | None:
+    """Where values are not the no-data value.
+
+    Parameters
+    ----------
+    data : (...) of the raster's own type
+    nodata : float or None
+
+    Returns
+    -------
+    (...) bool, or None when no finite value can be no-data
+    """
+    if nodata is None or not math.isfinite(nodata):
+        return None
+    if data.dtype.kind in "iu":
+        limits = np.iinfo(data.dtype)
+        if nodata != int(nodata) or not limits.min <= nodata <= limits.max:
+            return None
+        differs = data != data.dtype.type(int(nodata))
+    else:
+        margin = _FLOAT_TOLERANCE * abs(nodata) if data.dtype.itemsize <= 4 else 0.0
+        differs = (data < nodata - margin) | (data > nodata + margin)
+    return np.asarray(differs, dtype=np.bool_)
