@@ -1,0 +1,5 @@
+"""``python -m geodelreg_cli``."""
+
+from geodelreg_cli.main import main
+
+main()

@@ -1,0 +1,269 @@
+"""``geodelreg align``: parse, align, write what was asked for."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from geodelreg.errors import AlignmentRefusedError, UsageError
+from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg_cli.console import configure_logging, progress_bar
+from geodelreg_cli.options import SectionCommand, SectionOption, add_options, build, knob_option
+from geodelreg_cli.outputs import check_targets, raster_targets
+
+if TYPE_CHECKING:
+    from geodelreg.types import Alignment
+
+OUTPUT, CORRECTION, FORMAT, RUN = "Output", "How to align", "How OUT is written", "Run"
+FILE = click.Path(path_type=Path)
+
+EPILOG = """\
+Examples:
+
+  Correct the header of MS; pixels stay bit-identical:
+    geodelreg align ms.tif pan.tif -o aligned.tif
+
+  Edit the header of the file itself (undo it with "geodelreg revert"):
+    geodelreg align ms.tif pan.tif --in-place
+
+  One file per band, one correction for all of them; OUT is a folder:
+    geodelreg align B2.tif B3.tif B4.tif B8.tif -o aligned/
+
+  Also write the control points for QGIS and GDAL, a report and a figure:
+    geodelreg align ms.tif pan.tif -o aligned.tif --gcps ms.points \\
+        --gcps ms.geojson --report aligned.json --figure aligned.png
+
+  Look before you write, and pick one number out of the result:
+    geodelreg align ms.tif pan.tif --dry-run --json | jq .accuracy
+
+  Resample onto the grid of PAN instead of correcting the header:
+    geodelreg align ms.tif pan.tif -o aligned.tif --warp --grid pan
+
+Exit codes: 0 done, 1 failed, 2 wrong usage, 3 refused (nothing written, the reason on stderr).
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the user asked for, checked for contradictions."""
+
+    sources: tuple[str, ...]
+    reference: str
+    output: Path | None
+    in_place: bool
+    dry_run: bool
+    gcps: tuple[Path, ...]
+    gcp_format: str | None
+    report: Path | None
+    figure: Path | None
+    json: bool
+    quiet: bool
+    options: AlignOptions
+    write_options: WriteOptions
+
+
+def align_params() -> list[SectionOption]:
+    """Options of ``align``, in the order of the help."""
+
+    def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
+        return SectionOption(names, section=section, **kwargs)
+
+    write_knobs = [f.name for f in fields(WriteOptions) if f.name != "overwrite"]
+    align_knobs = [f.name for f in fields(AlignOptions) if f.name != "threads"]
+    return [
+        flag(
+            "-o",
+            "--output",
+            type=FILE,
+            metavar="OUT",
+            section=OUTPUT,
+            help="Corrected MS raster; with several MS files, the folder for them.",
+        ),
+        flag(
+            "--in-place",
+            is_flag=True,
+            section=OUTPUT,
+            help="Correct the header of MS itself, whatever its size; keeps a record to undo it.",
+        ),
+        flag(
+            "--dry-run",
+            is_flag=True,
+            section=OUTPUT,
+            help="Find and report the correction, write no raster.",
+        ),
+        knob_option(WriteOptions, "overwrite", OUTPUT),
+        flag(
+            "--gcps",
+            type=FILE,
+            multiple=True,
+            metavar="FILE",
+            section=OUTPUT,
+            help="Write the tie points as ground control points; the format follows the extension: "
+            ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .vrt, "
+            ".pts ENVI. May be repeated.",
+        ),
+        flag(
+            "--gcp-format",
+            metavar="FORMAT",
+            section=OUTPUT,
+            help="Format of --gcps, when the extension does not say it.",
+        ),
+        flag(
+            "--report",
+            type=FILE,
+            metavar="FILE.json",
+            section=OUTPUT,
+            help="Write everything that was found out as JSON; also after a refusal.",
+        ),
+        flag(
+            "--figure",
+            type=FILE,
+            metavar="FILE.png",
+            section=OUTPUT,
+            help="Draw the tie points on both images (needs the report extra).",
+        ),
+        flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
+        *(knob_option(AlignOptions, name, CORRECTION) for name in align_knobs),
+        *(knob_option(WriteOptions, name, FORMAT) for name in write_knobs),
+        knob_option(AlignOptions, "threads", RUN),
+        flag(
+            "--config",
+            nargs=2,
+            multiple=True,
+            metavar="KEY VALUE",
+            section=RUN,
+            help="Configuration option of GDAL. May be repeated.",
+        ),
+        flag("-q", "--quiet", is_flag=True, section=RUN, help="Print errors only."),
+        flag("-v", "--verbose", count=True, section=RUN, help="Print the steps; -vv everything."),
+        flag("--debug", is_flag=True, section=RUN, help="Print a traceback with an error."),
+    ]
+
+
+@add_options(align_params())
+@click.command(cls=SectionCommand, epilog=EPILOG)
+@click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
+def align(rasters: tuple[str, ...], **given: Any) -> None:
+    """Correct the georeferencing of MS so that it fits PAN.
+
+    MS is a multispectral raster, or several files with one band each; PAN, the last argument, is
+    the raster to fit to. Both need a coordinate reference system and a geotransform; the two
+    systems may differ. OUT is MS with a corrected header: same pixels, same tags. An alignment
+    that the images do not support is refused, and nothing is written.
+    """
+    configure_logging(given["verbose"], given["quiet"], given["debug"])
+    _configure_gdal(given["config"])
+    request = _request(rasters, given)
+    _check_outputs(request)
+    _run(request)
+
+
+def _configure_gdal(pairs: tuple[tuple[str, str], ...]) -> None:
+    for key, value in pairs:
+        try:
+            os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
+        except ValueError as error:
+            raise click.UsageError(f"--config {key} {value}: {error}") from error
+
+
+def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
+    if len(rasters) < 2:
+        raise click.UsageError("Name at least two rasters: MS, then PAN.")
+    ways = [given["output"] is not None, given["in_place"], given["dry_run"]]
+    if sum(ways) != 1:
+        raise click.UsageError("Say where the result goes: one of -o OUT, --in-place, --dry-run.")
+    write_options = build(WriteOptions, given)
+    if given["in_place"] and write_options not in (WriteOptions(), WriteOptions(overwrite=True)):
+        raise click.UsageError(
+            "--in-place corrects the header and nothing else: drop --of, --co, --georef, "
+            "--strip-rpc and --warp, or write to -o OUT."
+        )
+    if given["gcp_format"] is not None and not given["gcps"]:
+        raise click.UsageError("--gcp-format needs --gcps FILE.")
+    return Request(
+        sources=rasters[:-1],
+        reference=rasters[-1],
+        output=given["output"],
+        in_place=given["in_place"],
+        dry_run=given["dry_run"],
+        gcps=given["gcps"],
+        gcp_format=given["gcp_format"],
+        report=given["report"],
+        figure=given["figure"],
+        json=given["json"],
+        quiet=given["quiet"],
+        options=build(AlignOptions, given),
+        write_options=write_options,
+    )
+
+
+def _check_outputs(request: Request) -> None:
+    rasters = [] if request.output is None else raster_targets(request.sources, request.output)
+    side_files = [*request.gcps, request.report, request.figure]
+    targets = [*rasters, *(path for path in side_files if path is not None)]
+    created = request.output if len(request.sources) > 1 else None
+    inputs = [*request.sources, request.reference]
+    try:
+        check_targets(inputs, targets, request.write_options.overwrite, created)
+    except UsageError as error:
+        raise click.UsageError(str(error)) from error
+
+
+def _run(request: Request) -> None:
+    """Align, then write what was asked for; a refusal leaves the report only."""
+    import geodelreg
+
+    source = request.sources[0] if len(request.sources) == 1 else request.sources
+    try:
+        with progress_bar(request.quiet) as progress:
+            alignment = geodelreg.align(
+                source, request.reference, request.options, progress=progress
+            )
+    except AlignmentRefusedError as refusal:
+        if refusal.alignment is not None:
+            _report(refusal.alignment, request)
+        raise
+    _write(alignment, request)
+    _report(alignment, request)
+    if not request.quiet:
+        from geodelreg.product.report import summary_text
+
+        click.echo(summary_text(alignment), err=True)
+
+
+def _write(alignment: Alignment, request: Request) -> None:
+    """Write the raster first: what it can refuse must leave no side files behind."""
+    import geodelreg
+
+    warnings: list[str] = []
+    if request.in_place:
+        warnings = geodelreg.write_in_place(alignment)
+    elif request.output is not None:
+        warnings = geodelreg.write(alignment, request.output, request.write_options)
+    for warning in (*alignment.warnings, *warnings):
+        logging.getLogger(__name__).warning("warning: %s", warning)
+    for path in request.gcps:
+        geodelreg.export_gcps(
+            alignment, path, request.gcp_format, overwrite=request.write_options.overwrite
+        )
+    if request.figure is not None:
+        from geodelreg.product.figures import write_figure
+
+        write_figure(alignment, request.figure)
+
+
+def _report(alignment: Alignment, request: Request) -> None:
+    if request.report is None and not request.json:
+        return
+    from geodelreg.product.report import report_json
+
+    text = report_json(alignment)
+    if request.report is not None:
+        request.report.write_text(text + "\n", encoding="utf-8")
+    if request.json:
+        click.echo(text)

@@ -1,0 +1,71 @@
+"""What the user sees on stderr: logs, warnings and the progress bar."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+
+Progress = Callable[[float, str], None]
+
+
+class _Stderr(logging.Handler):
+    """Log records to whatever stderr is now: the progress bar replaces it while it is shown."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record."""
+        click.echo(self.format(record), err=True)
+
+
+def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
+    """Send logs to stderr: warnings always but with -q, progress of the steps with -v.
+
+    What GDAL has to say about a broken file is in the error that geodelreg raises, so GDAL's own
+    messages are shown from -v on only.
+
+    Parameters
+    ----------
+    verbose : int
+        0 warnings, 1 info, 2 and more everything.
+    quiet : bool
+        Errors only.
+    debug : bool
+        Everything, with the names of the loggers.
+    """
+    level = logging.ERROR if quiet else max(logging.DEBUG, logging.WARNING - 10 * verbose)
+    handler = _Stderr()
+    handler.setFormatter(
+        logging.Formatter(
+            "%(levelname)s %(name)s: %(message)s" if debug else "geodelreg: %(message)s"
+        )
+    )
+    root = logging.getLogger()
+    root.handlers = [handler]
+    root.setLevel(logging.DEBUG if debug else level)
+    if not (debug or verbose):
+        logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+        logging.getLogger("py.warnings").setLevel(logging.CRITICAL)
+    logging.captureWarnings(True)
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Progress | None]:
+    """Show a bar while the block runs, on a terminal only; None when there is nothing to show."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with RichProgress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def show(fraction: float, text: str) -> None:
+            bar.update(task, completed=fraction, description=text)
+
+        yield show

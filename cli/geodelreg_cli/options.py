@@ -1,0 +1,159 @@
+"""Click options made from the knobs of `geodelreg.options`, and help in sections.
+
+A knob is documented once, in its dataclass; name, type, default and help of its flag come from
+there: ``search_radius_px`` is ``--search-radius PX``.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, Field, fields
+from typing import Any, TypeVar
+
+import click
+
+from geodelreg.errors import UsageError
+
+_Options = TypeVar("_Options")
+
+UNITS = {"_px": "PX", "_deg": "DEG"}
+TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": click.BOOL}
+# Flags that GDAL's users know by another name than the knob's.
+FLAGS = {
+    "band": ("-b", "--band"),
+    "threads": ("-j", "--num-threads"),
+    "driver": ("--of",),
+    "creation_options": ("--co",),
+    "warp_grid": ("--grid",),
+    "resampling": ("-r", "--resampling"),
+}
+
+
+class NumberOr(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
+    """A whole number, or a word that stands for a value."""
+
+    def __init__(self, word: str, meaning: int | None) -> None:
+        self.name = f"N|{word}"
+        self.word = word
+        self.meaning = meaning
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | None:
+        """Parse what the user typed."""
+        if isinstance(value, int):
+            return value
+        if str(value).lower() == self.word.lower():
+            return self.meaning
+        try:
+            return int(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither a whole number nor {self.word}.", param, ctx)
+
+
+# Knobs whose default is a word on the command line.
+WORDS = {"band": NumberOr("auto", None), "threads": NumberOr("ALL_CPUS", 0)}
+
+
+class SectionOption(click.Option):
+    """An option that is listed under a heading of its own in the help."""
+
+    def __init__(self, *args: Any, section: str = "Options", **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.section = section
+
+
+class SectionCommand(click.Command):
+    """A command whose help groups the options by section and keeps the layout of its epilog."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write one definition list a section, in order of first appearance."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = None if isinstance(param, click.Argument) else param.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(getattr(param, "section", "Options"), []).append(record)
+        for name, records in sections.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog as it is."""
+        if self.epilog:
+            formatter.write_paragraph()
+            formatter.write(inspect.cleandoc(self.epilog) + "\n")
+
+
+def flags(knob: str) -> tuple[str, ...]:
+    """Flags of a knob: ``("--search-radius",)`` for ``search_radius_px``."""
+    bare = next((knob.removesuffix(unit) for unit in UNITS if knob.endswith(unit)), knob)
+    return FLAGS.get(knob, ("--" + bare.replace("_", "-"),))
+
+
+def knob_option(options: type, knob: str, section: str) -> SectionOption:
+    """Click option of one knob.
+
+    Parameters
+    ----------
+    options : type
+        `AlignOptions` or `WriteOptions`.
+    knob : str
+        Name of its field.
+    section : str
+        Heading in the help.
+    """
+    field = {f.name: f for f in fields(options)}[knob]
+    return SectionOption(
+        [knob, *flags(knob)], section=section, help=field.metadata["help"], **_kind(field)
+    )
+
+
+def _kind(field: Field[Any]) -> dict[str, Any]:
+    """Type, default and metavar: the arguments of `click.Option` that depend on the knob's type."""
+    assert field.default is not MISSING
+    kind = str(field.type).split(" | ")[0]
+    if kind == "bool":
+        return {"is_flag": True, "default": field.default}
+    if kind.startswith("tuple"):
+        return {"multiple": True, "default": field.default, "metavar": "KEY=VALUE"}
+    if field.name in WORDS:
+        word = WORDS[field.name]
+        return {"type": word, "default": word.word, "show_default": True, "metavar": word.name}
+    choices = field.metadata["choices"]
+    unit = next((UNITS[u] for u in UNITS if field.name.endswith(u)), None)
+    return {
+        "type": click.Choice(choices) if choices else TYPES[kind],
+        "default": f"{field.default:g}" if isinstance(field.default, float) else field.default,
+        "show_default": True,
+        "metavar": unit,
+    }
+
+
+def add_options(options: Iterable[SectionOption]) -> Callable[[click.Command], click.Command]:
+    """Decorator that appends options to a command."""
+
+    def decorate(command: click.Command) -> click.Command:
+        command.params.extend(options)
+        return command
+
+    return decorate
+
+
+def build(options: type[_Options], given: Mapping[str, Any]) -> _Options:
+    """Make the options object out of the values click has parsed.
+
+    Raises
+    ------
+    click.UsageError
+        With the flag the user typed in place of the knob's name.
+    """
+    names = [f.name for f in fields(options)]  # type: ignore[arg-type]
+    try:
+        return options(**{name: given[name] for name in names})
+    except UsageError as error:
+        cause = str(error)
+        knob = next((name for name in names if cause.startswith(f"{name} ")), None)
+        if knob is not None:
+            cause = flags(knob)[-1] + cause.removeprefix(knob)
+        raise click.UsageError(cause) from error
