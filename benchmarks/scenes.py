@@ -22,7 +22,7 @@ from benchmarks.truth import Truth
 
 log = logging.getLogger(__name__)
 PAN_WEIGHTS = (0.12, 0.34, 0.36, 0.18)
-PAN_GAMMA = 0.93
+PAN_GAMMA = 0.97
 BAND_GAMMAS = (1.0, 0.96, 1.05, 0.9)
 BAND_GAINS = (1.1, 1.0, 0.95, 0.85)
 BLUR_MS_PX = 0.35
