@@ -162,15 +162,15 @@ def _lattice_windows(
     source: Grid, reference: Grid, grow_px: float, map_points: MapPoints
 ) -> tuple[Window, Window] | None:
     """`overlap_windows` of rasters so large that neither outline can be followed."""
-    near = _lattice_near(source, reference, grow_px, map_points)
-    if near is None:
-        return None
-    source_window, ends = near
+    there = _lattice_near(source, reference, grow_px, map_points)
     back = _lattice_near(reference, source, 0.0, map_points)
-    if back is not None:
-        left, top, width, height = back[0]
-        ends = np.vstack([ends, [[left, top], [left + width, top + height]]])
-    return source_window, _window_between(*_extremes(ends), grow_px + 1, reference.shape)
+    if len(there[0]) + len(back[0]) == 0:
+        return None
+    in_source, in_reference = np.vstack([there[0], back[1]]), np.vstack([there[1], back[0]])
+    return (
+        _window_between(*_extremes(in_source), 1.0, source.shape),
+        _window_between(*_extremes(in_reference), grow_px + 1.0, reference.shape),
+    )
 
 
 def _extremes(points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -180,10 +180,17 @@ def _extremes(points: FloatArray) -> tuple[tuple[float, float], tuple[float, flo
 
 def _lattice_near(
     moving: Grid, fixed: Grid, grow_px: float, map_points: MapPoints
-) -> tuple[Window, FloatArray] | None:
-    """Window of `moving` around the nodes of a lattice that fall into `fixed`, grown; their images."""
-    height, width = moving.shape
-    step = np.array([width, height]) / _LATTICE_STEPS
+) -> tuple[FloatArray, FloatArray]:
+    """Cells of a lattice over `moving` with a node inside `fixed`, grown, and the nodes' images.
+
+    Returns
+    -------
+    (2 N, 2) float64
+        Upper-left and lower-right corners of the cells around each node, in pixels of `moving`.
+    (N, 2) float64
+        Images of the nodes, in pixels of `fixed`.
+    """
+    step = np.array([moving.shape[1], moving.shape[0]]) / _LATTICE_STEPS
     columns, rows = np.meshgrid(*[np.arange(_LATTICE_STEPS + 1.0)] * 2)
     nodes = np.stack([columns.ravel(), rows.ravel()], axis=1) * step
     mapped = _map_pixels(nodes, moving, fixed, map_points)
@@ -191,10 +198,7 @@ def _lattice_near(
     with np.errstate(invalid="ignore"):
         near = ((mapped >= -grow_px) & (mapped <= limit)).all(axis=1)
     near &= _round_trips(nodes, mapped, moving, fixed, map_points)
-    if not near.any():
-        return None
-    around = np.vstack([nodes[near] - step, nodes[near] + step])
-    return _window_between(*_extremes(around), 0.0, moving.shape), mapped[near]
+    return np.vstack([nodes[near] - step, nodes[near] + step]), mapped[near]
 
 
 def _map_pixels(px: FloatArray, start: Grid, end: Grid, map_points: MapPoints) -> FloatArray:
