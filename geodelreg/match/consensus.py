@@ -1,0 +1,390 @@
+"""The one similarity or affine that many matches agree on, and how surprising that agreement is."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.match.descriptors import matched_xy, select
+from geodelreg.types import BoolArray, FloatArray, IntArray, Keypoints, Matches
+
+SAMPLE_SIZE = {"similarity": 2, "affine": 3}
+MAX_STRETCH = 8.0
+RESIDUAL_FLOOR_PX = 0.1
+
+_SCORED_MATCHES = 1000
+_SAMPLES_PER_ROUND = 500
+_MAX_ROUNDS = 40
+_REFINED_HYPOTHESES = 12
+_LOOSENING = (4.0, 2.0, 1.0, 1.0)
+_MAX_PAIRS = 1500
+_CONVINCING_SHARE = 0.3
+_MIN_BASELINE_PX = 16.0
+_LOG_SCALE_TOLERANCE = math.log(1.35)
+_TURN_TOLERANCE = math.radians(15.0)
+
+
+class Consensus(NamedTuple):
+    """A transformation and the matches that agree with it.
+
+    Attributes
+    ----------
+    matrix : (2, 3) float64
+        Source pixels to reference pixels; NaN when nothing was found.
+    inliers : (M,) bool
+    """
+
+    matrix: FloatArray
+    inliers: BoolArray
+
+
+def consensus_affine(
+    source_xy: FloatArray,
+    reference_xy: FloatArray,
+    ratio: FloatArray,
+    threshold_px: float,
+    seed: int = 0,
+    kind: str = "affine",
+) -> Consensus:
+    """Find the transformation that most matches agree on, by sampling.
+
+    Vectorised RANSAC that samples good ratios more often (after Chum & Matas 2005,
+    doi:10.1109/CVPR.2005.221) and refits the best hypotheses to their inliers (Chum et al. 2003,
+    doi:10.1007/978-3-540-45243-0_31).  Mirroring and scales beyond 1:8 are not considered.  Always
+    returns the best it saw: judge it by `log_nfa`.
+
+    Parameters
+    ----------
+    source_xy, reference_xy : (M, 2) float64
+        One-to-one matches, outer-corner pixels.
+    ratio : (M,) float64
+        Descriptor distance ratio; smaller is better.
+    threshold_px : float
+        Largest residual of an inlier, in reference pixels.
+    seed : int
+        Of the sampling; the same seed gives the same result.
+    kind : str
+        ``similarity`` or ``affine``.
+
+    Returns
+    -------
+    Consensus
+    """
+    size = SAMPLE_SIZE[kind]
+    count = len(source_xy)
+    if count < size:
+        return _nothing(count)
+    pool = np.argsort(ratio, kind="stable")[:_SCORED_MATCHES]
+    source, reference = source_xy[pool], reference_xy[pool]
+    rng = np.random.default_rng(seed)
+    matrices: list[FloatArray] = []
+    scores: list[FloatArray] = []
+    drawn, needed = 0, _SAMPLES_PER_ROUND
+    while drawn < min(needed, _MAX_ROUNDS * _SAMPLES_PER_ROUND):
+        hypotheses = _sampled_hypotheses(source, reference, rng, kind)
+        drawn += _SAMPLES_PER_ROUND
+        if len(hypotheses):
+            matrices.append(hypotheses)
+            scores.append(_scores(hypotheses, source, reference, threshold_px))
+            needed = _samples_needed(max(s.max() for s in scores), len(pool), size)
+    if not matrices:
+        return _nothing(count)
+    best = _best_of(np.concatenate(matrices), np.concatenate(scores))
+    return _refined(best, source_xy, reference_xy, threshold_px, kind)
+
+
+def consensus_keypoints(
+    source: Keypoints,
+    reference: Keypoints,
+    matches: Matches,
+    threshold_px: float,
+    seed: int = 0,
+    kind: str = "affine",
+) -> Consensus:
+    """Find the transformation that most matches agree on, from the keypoints' scales and angles.
+
+    One SIFT match alone implies a similarity.  Pairs of matches (of the best 1000) whose scales,
+    angles and relative position all tell the same one are the hypotheses: chance seldom makes such
+    a pair, so this stands far more outliers than sampling.  `consensus_affine` comes first, and its
+    result stays when it has a convincing share of the matches or simply more of them.
+
+    Parameters
+    ----------
+    source, reference : Keypoints
+    matches : Matches
+        One-to-one.
+    threshold_px, seed, kind
+        As in `consensus_affine`.
+
+    Returns
+    -------
+    Consensus
+        Inliers refer to `matches`.
+    """
+    source_xy, reference_xy = matched_xy(source, reference, matches)
+    sampled = consensus_affine(source_xy, reference_xy, matches.ratio, threshold_px, seed, kind)
+    convincing = sampled.inliers.sum() > _CONVINCING_SHARE * len(matches)
+    if convincing or len(matches) < SAMPLE_SIZE[kind]:
+        return sampled
+    pool = select(matches, np.argsort(matches.ratio, kind="stable")[:_SCORED_MATCHES])
+    pool_source, pool_reference = matched_xy(source, reference, pool)
+    first, second = _agreeing_pairs(source, reference, pool)
+    pair = np.stack([first, second], axis=1)
+    hypotheses = _through_two(pool_source[pair], pool_reference[pair])
+    hypotheses = hypotheses[_plausible(hypotheses)]
+    if len(hypotheses) == 0:
+        return sampled
+    scores = _scores(hypotheses, pool_source, pool_reference, threshold_px)
+    best = _best_of(hypotheses, scores)
+    paired = _refined(best, source_xy, reference_xy, threshold_px, kind)
+    return paired if paired.inliers.sum() >= sampled.inliers.sum() else sampled
+
+
+def log_nfa(
+    residual_px: FloatArray, area_px2: float, sample_size: int, max_residual_px: float = math.inf
+) -> tuple[float, float]:
+    """Expected number of chance agreements as good as this one (number of false alarms).
+
+    A contrario model: matched points fall anywhere in the reference, uniformly and independently
+    (Moisan & Stival 2004, doi:10.1023/B:VISI.0000013094.38752.5c; the form of Moulon, Monasse &
+    Marlet 2012, doi:10.1007/978-3-642-37447-0_20).  Below 0 (less than one false alarm), agreement
+    is unlikely to be chance; a gate should ask for much less.
+
+    Parameters
+    ----------
+    residual_px : (M,) float64
+        Radial residuals of all one-to-one matches that were available to the search, outliers too.
+    area_px2 : float
+        Area of the reference in which the matches could fall.
+    sample_size : int
+        Matches that fix the model: 1 for a shift, 2 for a similarity, 3 for an affine.
+    max_residual_px : float
+        Largest inlier threshold considered.
+
+    Returns
+    -------
+    log10_nfa : float
+        Minimum over the inlier thresholds; ``inf`` when there are no more matches than
+        `sample_size`.
+    threshold_px : float
+        Where it is reached; NaN when it is not.
+    """
+    residual = np.sort(np.maximum(residual_px, RESIDUAL_FLOOR_PX))
+    count = len(residual)
+    inliers = np.arange(sample_size + 1, count + 1)
+    inliers = inliers[residual[inliers - 1] <= max_residual_px]
+    if len(inliers) == 0:
+        return math.inf, math.nan
+    log_factorial = np.concatenate([[0.0], np.cumsum(np.log10(np.arange(1, count + 1)))])
+
+    def log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
+        return np.asarray(log_factorial[n] - log_factorial[k] - log_factorial[np.subtract(n, k)])
+
+    probability = np.minimum(np.pi * residual[inliers - 1] ** 2 / area_px2, 1.0)
+    log_counts = (
+        math.log10(count - sample_size)
+        + log_choose(count, inliers)
+        + log_choose(inliers, sample_size)
+        + (inliers - sample_size) * np.log10(probability)
+    )
+    best = int(log_counts.argmin())
+    return float(log_counts[best]), float(residual[inliers[best] - 1])
+
+
+def radial_residuals(
+    matrix: FloatArray, source_xy: FloatArray, reference_xy: FloatArray
+) -> FloatArray:
+    """(M,) float64, distance of each transformed source point from its reference point."""
+    return np.asarray(np.sqrt(_squared_residuals(matrix[None], source_xy, reference_xy)[0]))
+
+
+def fit_matrix(source_xy: FloatArray, reference_xy: FloatArray, kind: str) -> FloatArray:
+    """Least-squares (2, 3) similarity or affine from source to reference points.
+
+    Parameters
+    ----------
+    source_xy, reference_xy : (M, 2) float64
+        At least two points (similarity) or three that are not collinear (affine).
+    kind : str
+        ``similarity`` or ``affine``.
+    """
+    source_mean, reference_mean = source_xy.mean(axis=0), reference_xy.mean(axis=0)
+    s, r = source_xy - source_mean, reference_xy - reference_mean
+    if kind == "similarity":
+        power = max(float((s * s).sum()), np.finfo(np.float64).tiny)
+        along = float((s * r).sum()) / power
+        across = float((s[:, 0] * r[:, 1] - s[:, 1] * r[:, 0]).sum()) / power
+        linear = np.array([[along, -across], [across, along]])
+    else:
+        normal = np.einsum("mi,mj->ij", s, s)
+        linear = np.linalg.lstsq(normal, np.einsum("mi,mj->ij", s, r), rcond=None)[0].T
+    return np.column_stack([linear, reference_mean - linear @ source_mean])
+
+
+def _nothing(count: int) -> Consensus:
+    return Consensus(np.full((2, 3), np.nan), np.zeros(count, dtype=np.bool_))
+
+
+def _sampled_hypotheses(
+    source: FloatArray, reference: FloatArray, rng: np.random.Generator, kind: str
+) -> FloatArray:
+    """(S, 2, 3) float64, plausible transformations through random minimal samples.
+
+    Half of the samples prefer the leading matches (best ratios), half take all alike.
+    """
+    size, count = SAMPLE_SIZE[kind], len(source)
+    uniform = rng.random((_SAMPLES_PER_ROUND, size))
+    uniform[::2] **= 3
+    index = np.minimum((uniform * count).astype(np.intp), count - 1)
+    ordered = np.sort(index, axis=1)
+    index = index[(np.diff(ordered, axis=1) > 0).all(axis=1)]
+    s, r = source[index], reference[index]
+    matrices = _through_two(s, r) if kind == "similarity" else _through_three(s, r)
+    return matrices[_plausible(matrices)]
+
+
+def _through_two(source: FloatArray, reference: FloatArray) -> FloatArray:
+    """(S, 2, 3) similarities through (S, 2, 2) point pairs."""
+    s, r = source[:, 1] - source[:, 0], reference[:, 1] - reference[:, 0]
+    power = (s * s).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (s * r).sum(axis=1) / power
+        across = (s[:, 0] * r[:, 1] - s[:, 1] * r[:, 0]) / power
+        return _similarities(along, across, source[:, 0], reference[:, 0])
+
+
+def _through_three(source: FloatArray, reference: FloatArray) -> FloatArray:
+    """(S, 2, 3) affines through (S, 3, 2) point triples."""
+    s, r = source[:, 1:] - source[:, :1], reference[:, 1:] - reference[:, :1]
+    determinant = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] * s[:, 1, 0]
+    adjugate = np.stack(
+        [np.stack([s[:, 1, 1], -s[:, 0, 1]], 1), np.stack([-s[:, 1, 0], s[:, 0, 0]], 1)], 1
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        transposed = (adjugate @ r) / determinant[:, None, None]
+        linear = transposed.transpose(0, 2, 1)
+        offset = reference[:, 0] - np.einsum("sij,sj->si", linear, source[:, 0])
+    return np.concatenate([linear, offset[:, :, None]], axis=2)
+
+
+def _similarities(
+    along: FloatArray, across: FloatArray, source: FloatArray, reference: FloatArray
+) -> FloatArray:
+    """(S, 2, 3) similarities of given linear part that take each source to its reference point."""
+    matrices = np.empty((len(along), 2, 3))
+    matrices[:, 0, 0] = matrices[:, 1, 1] = along
+    matrices[:, 1, 0], matrices[:, 0, 1] = across, -across
+    turned = np.einsum("sij,sj->si", matrices[:, :, :2], source)
+    matrices[:, :, 2] = reference - turned
+    return matrices
+
+
+def _agreeing_pairs(
+    source: Keypoints, reference: Keypoints, matches: Matches
+) -> tuple[IntArray, IntArray]:
+    """Pairs of matches that imply one similarity, by scale, angle and relative position.
+
+    At most `_MAX_PAIRS`, best ratios first.
+    """
+    s, r = matches.source_index, matches.reference_index
+    log_scale = np.log(reference.scale_px[r] / source.scale_px[s])
+    turn = np.radians(reference.angle_deg[r] - source.angle_deg[s])
+    first, second = np.nonzero(
+        np.triu(np.abs(log_scale[:, None] - log_scale) < 2 * _LOG_SCALE_TOLERANCE, 1)
+        & (np.cos(turn[:, None] - turn) > math.cos(2 * _TURN_TOLERANCE))
+    )
+    source_step = _complex(source.xy[s[second]] - source.xy[s[first]])
+    reference_step = _complex(reference.xy[r[second]] - reference.xy[r[first]])
+    far = (np.abs(source_step) > _MIN_BASELINE_PX) & (np.abs(reference_step) > _MIN_BASELINE_PX)
+    first, second = first[far], second[far]
+    stretch = np.log(reference_step[far] / source_step[far])
+    agree = np.ones(len(first), dtype=np.bool_)
+    for end in (first, second):
+        agree &= np.abs(stretch.real - log_scale[end]) < _LOG_SCALE_TOLERANCE
+        agree &= np.cos(stretch.imag - turn[end]) > math.cos(_TURN_TOLERANCE)
+    first, second = first[agree], second[agree]
+    best = np.argsort(matches.ratio[first] + matches.ratio[second], kind="stable")[:_MAX_PAIRS]
+    return first[best], second[best]
+
+
+def _complex(xy: FloatArray) -> NDArray[np.complex128]:
+    return np.asarray(xy[:, 0] + 1j * xy[:, 1])
+
+
+def _plausible(matrices: FloatArray) -> BoolArray:
+    """True where a transformation is finite, does not mirror, and stretches by at most 1:8."""
+    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
+    with np.errstate(invalid="ignore", over="ignore"):
+        determinant = a * d - b * c
+        power = a * a + b * b + c * c + d * d
+        root = np.sqrt(np.maximum(power * power - 4 * determinant**2, 0.0))
+        largest, smallest = (power + root) / 2, (power - root) / 2
+        return np.asarray(
+            np.isfinite(power)
+            & (determinant > 0)
+            & (largest <= MAX_STRETCH**2)
+            & (smallest >= MAX_STRETCH**-2)
+        )
+
+
+def _scores(
+    matrices: FloatArray, source: FloatArray, reference: FloatArray, threshold_px: float
+) -> FloatArray:
+    """(S,) float64, sum over the matches of 1 - (residual / threshold)², at least 0 each."""
+    squared = _squared_residuals(matrices, source, reference)
+    return np.asarray(np.maximum(1.0 - squared / threshold_px**2, 0.0).sum(axis=1))
+
+
+def _squared_residuals(
+    matrices: FloatArray, source: FloatArray, reference: FloatArray
+) -> FloatArray:
+    """(S, M) float64."""
+    squared = np.zeros((len(matrices), len(source)))
+    for axis in (0, 1):
+        gap = matrices[:, axis, :1] * source[:, 0]
+        gap += matrices[:, axis, 1:2] * source[:, 1]
+        gap += matrices[:, axis, 2:]
+        gap -= reference[:, axis]
+        squared += gap * gap
+    return squared
+
+
+def _samples_needed(inliers: float, count: int, size: int) -> int:
+    """Samples after which an all-inlier one has been seen with probability 0.9999."""
+    share = min(max(inliers, size) / count, 1.0)
+    if share == 1.0:
+        return 0
+    return int(math.log(1e-4) / math.log1p(-(share**size))) + 1
+
+
+def _best_of(matrices: FloatArray, scores: FloatArray) -> FloatArray:
+    """(K, 2, 3), the hypotheses of highest score."""
+    return matrices[np.argsort(-scores, kind="stable")[:_REFINED_HYPOTHESES]]
+
+
+def _refined(
+    hypotheses: FloatArray,
+    source_xy: FloatArray,
+    reference_xy: FloatArray,
+    threshold_px: float,
+    kind: str,
+) -> Consensus:
+    """Refit each hypothesis to its inliers under a shrinking threshold; the one with most wins."""
+    best, best_score = _nothing(len(source_xy)), -1.0
+    for hypothesis in hypotheses:
+        matrix = hypothesis
+        for loosening in _LOOSENING:
+            near = radial_residuals(matrix, source_xy, reference_xy) < loosening * threshold_px
+            if near.sum() <= SAMPLE_SIZE[kind]:
+                break
+            matrix = fit_matrix(source_xy[near], reference_xy[near], kind)
+        if not _plausible(matrix[None])[0]:
+            continue
+        score = float(_scores(matrix[None], source_xy, reference_xy, threshold_px)[0])
+        if score > best_score:
+            inliers = radial_residuals(matrix, source_xy, reference_xy) <= threshold_px
+            best, best_score = Consensus(matrix, inliers), score
+    return best
