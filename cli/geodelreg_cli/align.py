@@ -13,7 +13,14 @@ import click
 from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg_cli.console import configure_logging, progress_bar
-from geodelreg_cli.options import SectionCommand, SectionOption, add_options, build, knob_option
+from geodelreg_cli.options import (
+    GCP_FORMAT,
+    SectionCommand,
+    SectionOption,
+    add_options,
+    build,
+    knob_option,
+)
 from geodelreg_cli.outputs import check_targets, raster_targets
 
 if TYPE_CHECKING:
@@ -109,7 +116,7 @@ def align_params() -> list[SectionOption]:
         ),
         flag(
             "--gcp-format",
-            metavar="FORMAT",
+            type=GCP_FORMAT,
             section=OUTPUT,
             help="Format of --gcps, when the extension does not say it.",
         ),
@@ -206,12 +213,27 @@ def _check_outputs(request: Request) -> None:
     rasters = [] if request.output is None else raster_targets(request.sources, request.output)
     side_files = [*request.gcps, request.report, request.figure]
     targets = [*rasters, *(path for path in side_files if path is not None)]
+    _check_gcp_formats(request)
     created = request.output if len(request.sources) > 1 else None
     inputs = [*request.sources, request.reference]
     try:
         check_targets(inputs, targets, request.write_options.overwrite, created)
     except UsageError as error:
         raise click.UsageError(str(error)) from error
+
+
+def _check_gcp_formats(request: Request) -> None:
+    if not request.gcps or request.gcp_format is not None:
+        return
+    from geodelreg.product.gcps import GCP_FORMATS
+
+    known = {suffix for spec in GCP_FORMATS.values() for suffix in spec.extensions}
+    for path in request.gcps:
+        if path.suffix.lower() not in known:
+            raise click.UsageError(
+                f"--gcps {path}: the extension says no format; add --gcp-format, or use one of "
+                + ", ".join(sorted(known))
+            )
 
 
 def _run(request: Request) -> None:

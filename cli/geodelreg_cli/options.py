@@ -56,6 +56,9 @@ class NumberOr(click.ParamType):  # type: ignore[type-arg]  # generic from click
 WORDS = {"band": NumberOr("auto", None), "threads": NumberOr("ALL_CPUS", 0)}
 
 
+GCP_FORMAT = click.Choice(("qgis", "gdal", "csv", "geojson", "vrt", "envi", "envi-map"))
+
+
 class SectionOption(click.Option):
     """An option that is listed under a heading of its own in the help."""
 

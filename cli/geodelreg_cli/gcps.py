@@ -1,0 +1,93 @@
+"""``geodelreg gcps``: control points from one file format to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from geodelreg_cli.console import configure_logging
+from geodelreg_cli.options import GCP_FORMAT, SectionCommand
+
+if TYPE_CHECKING:
+    from geodelreg.types import Gcp
+
+EPILOG = """\
+Examples:
+
+  From a QGIS georeferencer file to the options of gdal_translate:
+    geodelreg gcps ms.points ms.txt --raster ms.tif
+
+  To ENVI, image to image, which also needs the reference:
+    geodelreg gcps ms.geojson ms.pts --raster ms.tif --reference pan.tif
+
+Formats: qgis (.points), gdal (.gcp, .txt: gdal_translate --optfile), csv (.csv: gdal raster edit),
+geojson (.geojson, .json), vrt (.vrt), envi (.pts, image to image), envi-map (image to map).
+"""
+
+
+@click.command(cls=SectionCommand, epilog=EPILOG)
+@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
+@click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
+@click.option(
+    "--raster",
+    required=True,
+    metavar="MS",
+    help="Raster that the points belong to, with its original georeferencing.",
+)
+@click.option(
+    "--reference", metavar="PAN", help="Raster that the map coordinates come from (for ENVI)."
+)
+@click.option("--from", "from_format", type=GCP_FORMAT, help="Format of IN, if not by extension.")
+@click.option("--to", "to_format", type=GCP_FORMAT, help="Format of OUT, if not by extension.")
+@click.option("--overwrite", is_flag=True, help="Replace OUT when it exists.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
+@click.option("-v", "--verbose", count=True, help="Print the steps; -vv everything.")
+@click.option("--debug", is_flag=True, help="Print a traceback with an error.")
+def gcps(
+    source: Path,
+    target: Path,
+    raster: str,
+    reference: str | None,
+    from_format: str | None,
+    to_format: str | None,
+    overwrite: bool,
+    quiet: bool,
+    verbose: int,
+    debug: bool,
+) -> None:
+    """Convert the ground control points of file IN to file OUT.
+
+    Pixel conventions are converted exactly (QGIS and ENVI count differently from GDAL), and map
+    coordinates in another system than that of MS are transformed into it.
+    """
+    configure_logging(verbose, quiet, debug)
+    from geodelreg.image.reader import open_raster
+    from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
+
+    context = GcpContext(
+        source=open_raster(raster).grid,
+        reference=None if reference is None else open_raster(reference).grid,
+        source_paths=(raster,),
+        reference_path=reference or "",
+    )
+    points, crs_wkt = read_gcps(source, from_format, context)
+    if crs_wkt is not None:
+        points = _in_crs(points, crs_wkt, context.source.crs_wkt)
+    write_gcps(target, points, to_format, context=context, overwrite=overwrite)
+    if not quiet:
+        click.echo(f"{target}: {len(points)} points", err=True)
+
+
+def _in_crs(points: tuple[Gcp, ...], from_wkt: str, to_wkt: str) -> tuple[Gcp, ...]:
+    import numpy as np
+
+    from geodelreg.geo.crs import map_points
+
+    ground = np.array([(point.x, point.y) for point in points], dtype=np.float64).reshape(-1, 2)
+    moved = map_points(ground, from_wkt, to_wkt)
+    return tuple(
+        replace(point, x=x, y=y) for point, (x, y) in zip(points, moved.tolist(), strict=True)
+    )
