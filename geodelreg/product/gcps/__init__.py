@@ -1,0 +1,210 @@
+"""Ground control points in the formats of other tools, half a pixel right in each.
+
+`gcps_from_alignment` makes them, `write_gcps` and `read_gcps` are the doors; one module per format.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geodelreg.errors import GcpFormatError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.crs import map_points
+from geodelreg.product.atomic import write_text_atomically
+from geodelreg.product.gcps import envi, geojson, optfile, qgis, table, vrt
+from geodelreg.product.gcps.context import (
+    Decoded,
+    Decoder,
+    Encoder,
+    GcpContext,
+    gcp_context,
+    reading_order,
+)
+from geodelreg.types import Alignment, Gcp, TiePoints
+
+__all__ = [
+    "GCP_FORMATS",
+    "GcpContext",
+    "GcpFormat",
+    "gcp_context",
+    "gcps_from_alignment",
+    "read_gcps",
+    "write_gcps",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class GcpFormat:
+    """One file format: its extensions (the first format that names one is its default)."""
+
+    extensions: tuple[str, ...]
+    description: str
+    encode: Encoder
+    decode: Decoder
+
+
+GCP_FORMATS = {
+    "qgis": GcpFormat((".points",), "QGIS georeferencer", qgis.encode, qgis.decode),
+    "gdal": GcpFormat((".gcp", ".txt"), "gdal_translate --optfile", optfile.encode, optfile.decode),
+    "csv": GcpFormat((".csv",), "gdal raster edit --gcp @FILE", table.encode, table.decode),
+    "geojson": GcpFormat(
+        (".geojson", ".json"), "GeoJSON, as rio gcps", geojson.encode, geojson.decode
+    ),
+    "vrt": GcpFormat((".vrt",), "VRT of the source raster with GCPs", vrt.encode, vrt.decode),
+    "envi": GcpFormat(
+        (".pts",), "ENVI image to image", envi.encode_image_to_image, envi.decode_image_to_image
+    ),
+    "envi-map": GcpFormat(
+        (), "ENVI image to map", envi.encode_image_to_map, envi.decode_image_to_map
+    ),
+}
+
+
+def gcps_from_alignment(alignment: Alignment) -> tuple[Gcp, ...]:
+    """Ground control points of the kept tie points, by MS row, then column.
+
+    Parameters
+    ----------
+    alignment : Alignment
+
+    Returns
+    -------
+    tuple of Gcp
+        MS pixel ↔ map coordinates of the same feature in the reference raster, carried exactly into
+        the CRS of the MS raster.  Identifiers are "1" … "N".
+
+    Raises
+    ------
+    CrsTransformError
+        If the two CRSs are not connected.
+    """
+    points, reference = alignment.tie_points, alignment.reference
+    order = reading_order(points)
+    ground = map_points(
+        apply_affine(reference.transform, points.reference_px[order]),
+        reference.crs_wkt,
+        alignment.source.crs_wkt,
+    )
+    return tuple(
+        Gcp(str(number), column, row, x, y, info=_info(points, int(index)))
+        for number, (index, (column, row), (x, y)) in enumerate(
+            zip(order, points.source_px[order].tolist(), ground.tolist(), strict=True), start=1
+        )
+    )
+
+
+def _info(points: TiePoints, index: int) -> str:
+    """Residual and standard deviation, in PAN pixels, as far as they are known."""
+    texts = []
+    for name, (x, y) in (
+        ("residual", points.residual_px[index]),
+        ("sigma", points.sigma_px[index]),
+    ):
+        if np.isfinite(x) and np.isfinite(y):
+            texts.append(f"{name} {x:.4f} {y:.4f} px")
+    return "; ".join(texts)
+
+
+def write_gcps(
+    path: str | Path,
+    gcps: Sequence[Gcp],
+    format: str | None = None,  # noqa: A002 - the field's word
+    *,
+    context: GcpContext,
+    overwrite: bool = False,
+) -> None:
+    """Write GCPs to a file, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    gcps : sequence of Gcp
+        Pixels in the outer-corner convention, map coordinates in the CRS of ``context.source``.
+    format : str, optional
+        Key of `GCP_FORMATS`; by the extension of `path` when not given.
+    context : GcpContext
+        What the formats say beside the points.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    GcpFormatError
+        If the format is unknown, lacks something in `context`, or a coordinate is not finite.
+    OutputExistsError, OutputUnwritableError
+        As `write_text_atomically` raises them.
+    """
+    target = Path(path)
+    chosen = _format(format or _format_by_extension(target))
+    for gcp in gcps:
+        if not all(map(math.isfinite, (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z))):
+            raise GcpFormatError(f"{target}: point {gcp.id} has a coordinate that is not finite")
+    write_text_atomically(target, chosen.encode(gcps, context, target), overwrite)
+
+
+def read_gcps(
+    path: str | Path,
+    format: str | None = None,  # noqa: A002 - the field's word
+    context: GcpContext | None = None,
+) -> Decoded:
+    """Read GCPs.
+
+    Parameters
+    ----------
+    path : str or Path
+    format : str, optional
+        Key of `GCP_FORMATS`; by the extension (and first line, for ENVI) when not given.
+    context : GcpContext, optional
+        Grids that QGIS (``source``) and ENVI image-to-image files (both) refer to.
+
+    Returns
+    -------
+    gcps : tuple of Gcp
+    crs_wkt : str or None
+        CRS of the map coordinates, None when the file does not tell.
+
+    Raises
+    ------
+    GcpFormatError
+        If the file cannot be read as that format; the message names file and line.
+    """
+    source = Path(path)
+    name = format or _format_by_extension(source)
+    try:
+        text = source.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise GcpFormatError(f"{source} cannot be read ({error})") from error
+    if format is None and name == "envi" and envi.is_image_to_map(text):
+        name = "envi-map"
+    try:
+        return _format(name).decode(text, context)
+    except GcpFormatError as error:
+        raise GcpFormatError(f"{source}: {error.cause}", error.remedy) from error
+
+
+def _format(name: str) -> GcpFormat:
+    if name not in GCP_FORMATS:
+        raise GcpFormatError(f"GCP format {name!r} is unknown", _choices())
+    return GCP_FORMATS[name]
+
+
+def _format_by_extension(path: Path) -> str:
+    for name, spec in GCP_FORMATS.items():
+        if path.suffix.lower() in spec.extensions:
+            return name
+    raise GcpFormatError(
+        f"the extension of {path.name} is that of no GCP format", f"{_choices()} Or name it."
+    )
+
+
+def _choices() -> str:
+    texts = [
+        f"{name} ({', '.join((*spec.extensions, spec.description))})"
+        for name, spec in GCP_FORMATS.items()
+    ]
+    return f"Formats: {'; '.join(texts)}."

@@ -1,0 +1,134 @@
+"""What a GCP file needs beside the points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from affine import Affine
+
+from geodelreg.errors import GcpFormatError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.crs import map_points
+from geodelreg.types import Alignment, FloatArray, Gcp, Grid, IntArray, TiePoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GcpContext:
+    """The rasters that the points connect.
+
+    Attributes
+    ----------
+    source : Grid
+        Original grid of the MS raster; its CRS is that of the points' map coordinates.
+    corrected : Affine or None
+        Corrected geotransform of the MS raster; the residuals in QGIS files refer to it.
+    reference : Grid or None
+        Grid of the PAN raster, for ENVI image-to-image files.
+    source_paths : tuple of str
+        MS file, or one file per band.
+    reference_path : str
+    reference_px : (N, 2) float64 or None
+        Outer-corner PAN pixel of every point, in the points' order; worked out from `reference`
+        when not given.
+    """
+
+    source: Grid
+    corrected: Affine | None = None
+    reference: Grid | None = None
+    source_paths: tuple[str, ...] = ()
+    reference_path: str = ""
+    reference_px: FloatArray | None = None
+
+    @property
+    def source_label(self) -> str:
+        """MS file or files, as one line of text."""
+        return ", ".join(self.source_paths)
+
+
+Decoded = tuple[tuple[Gcp, ...], str | None]
+Encoder = Callable[[Sequence[Gcp], GcpContext, Path], str]
+Decoder = Callable[[str, GcpContext | None], Decoded]
+
+
+def reading_order(tie_points: TiePoints) -> IntArray:
+    """Indices (K,) of the kept tie points, by MS row, then column."""
+    kept = np.flatnonzero(tie_points.kept)
+    columns, rows = tie_points.source_px[kept].T
+    return kept[np.lexsort((columns, rows))]
+
+
+def gcp_context(alignment: Alignment) -> GcpContext:
+    """Context of `gcps_from_alignment`'s points, in the same order."""
+    points = alignment.tie_points
+    return GcpContext(
+        source=alignment.source,
+        corrected=alignment.correction.corrected,
+        reference=alignment.reference,
+        source_paths=alignment.source_paths,
+        reference_path=alignment.reference_path,
+        reference_px=points.reference_px[reading_order(points)],
+    )
+
+
+def pixels_of(gcps: Sequence[Gcp]) -> FloatArray:
+    """(N, 2) float64 outer-corner MS pixels."""
+    return np.array([(gcp.column, gcp.row) for gcp in gcps], dtype=np.float64).reshape(-1, 2)
+
+
+def ground_of(gcps: Sequence[Gcp]) -> FloatArray:
+    """(N, 2) float64 map coordinates in the MS CRS."""
+    return np.array([(gcp.x, gcp.y) for gcp in gcps], dtype=np.float64).reshape(-1, 2)
+
+
+def reference_pixels(gcps: Sequence[Gcp], context: GcpContext) -> FloatArray:
+    """(N, 2) float64 outer-corner PAN pixels of the points.
+
+    Raises
+    ------
+    GcpFormatError
+        If the context knows neither the pixels nor the PAN grid.
+    """
+    if context.reference_px is not None:
+        if len(context.reference_px) != len(gcps):
+            raise GcpFormatError(
+                f"{len(gcps)} points come with {len(context.reference_px)} reference pixels"
+            )
+        return context.reference_px
+    if context.reference is None:
+        raise GcpFormatError(
+            "image-to-image points need the reference raster's grid", "Name the reference raster."
+        )
+    reference = context.reference
+    ground = map_points(ground_of(gcps), context.source.crs_wkt, reference.crs_wkt)
+    return apply_affine(~reference.transform, ground)
+
+
+def numbers(fields: Sequence[str], line: int) -> list[float]:
+    """Finite floats of text fields.
+
+    Raises
+    ------
+    GcpFormatError
+        Naming the line.
+    """
+    try:
+        values = [float(text) for text in fields]
+    except ValueError as error:
+        raise GcpFormatError(f"line {line}: {error}") from error
+    if not all(math.isfinite(value) for value in values):
+        raise GcpFormatError(f"line {line}: a coordinate is not finite")
+    return values
+
+
+def exact(value: float) -> str:
+    """Shortest text that reads back as the same float64."""
+    return repr(float(value))
+
+
+def one_line(wkt: str) -> str:
+    """WKT without line breaks."""
+    return "".join(part.strip() for part in wkt.splitlines())

@@ -1,0 +1,50 @@
+"""CSV of ``gdal raster edit --gcp @FILE`` (GDAL ≥ 3.12), fields found by name."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from geodelreg.errors import GcpFormatError
+from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers
+from geodelreg.types import Gcp
+
+_FIELDS = ("id", "info", "column", "line", "x", "y", "z")
+_REQUIRED = ("column", "line", "x", "y")
+
+
+def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
+    """Text of a CSV file with a header line."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(_FIELDS)
+    for gcp in gcps:
+        values = (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z)
+        writer.writerow((gcp.id, gcp.info, *map(exact, values)))
+    return buffer.getvalue()
+
+
+def decode(text: str, context: GcpContext | None) -> Decoded:
+    """GCPs of a CSV file; the format has no room for a CRS.
+
+    Raises
+    ------
+    GcpFormatError
+        If a required field is missing or a value is no number.
+    """
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    names = {name.strip().lower(): name for name in reader.fieldnames or ()}
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise GcpFormatError(
+            f"the header line lacks {', '.join(missing)}", f"Its fields are {', '.join(_FIELDS)}."
+        )
+    gcps = []
+    for index, record in enumerate(reader, start=1):
+        row = {name: record[original] or "" for name, original in names.items()}
+        column, line, x, y = numbers([row[name] for name in _REQUIRED], reader.line_num)
+        z = numbers([row["z"]], reader.line_num)[0] if row.get("z") else 0.0
+        gcps.append(Gcp(row.get("id") or str(index), column, line, x, y, z, row.get("info", "")))
+    return tuple(gcps), None

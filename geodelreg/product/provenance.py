@@ -1,0 +1,121 @@
+"""Where a result came from: fingerprints of the inputs and the ``GEODELREG_*`` tags of outputs."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from geodelreg import __version__
+from geodelreg.types import Alignment
+
+_END_BYTES = 1 << 20
+_BLOCK_BYTES = 1 << 16
+_BLOCKS = 64
+_WHOLE_BYTES = 2 * _END_BYTES + _BLOCKS * _BLOCK_BYTES
+
+
+def fingerprint(path: str | Path) -> str:
+    """Digest that tells files apart after reading at most 6 MiB of them.
+
+    SHA-256 over the size (8 bytes, little-endian) and the contents: all of them up to 6 MiB; of a
+    larger file the first and the last MiB and 64 blocks of 64 KiB spaced evenly between them.  So
+    it sees any change of size or header, but not every change of single pixels of a huge file.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    str
+        ``sha256:`` (everything read) or ``sha256-sampled:`` and 64 hexadecimal digits; "" when
+        `path` is no local file, as for GDAL's ``/vsi…`` names.
+    """
+    if not Path(path).is_file():
+        return ""
+    with Path(path).open("rb") as stream:
+        size = os.fstat(stream.fileno()).st_size
+        digest = hashlib.sha256(size.to_bytes(8, "little"))
+        if size <= _WHOLE_BYTES:
+            digest.update(stream.read(_WHOLE_BYTES))
+            return f"sha256:{digest.hexdigest()}"
+        last = size - _END_BYTES
+        room = last - _END_BYTES - _BLOCK_BYTES
+        starts = [_END_BYTES + room * block // (_BLOCKS - 1) for block in range(_BLOCKS)]
+        for start, length in [(0, _END_BYTES), *((s, _BLOCK_BYTES) for s in starts)]:
+            stream.seek(start)
+            digest.update(stream.read(length))
+        stream.seek(last)
+        digest.update(stream.read(_END_BYTES))
+    return f"sha256-sampled:{digest.hexdigest()}"
+
+
+def source_date() -> str | None:
+    """Date of ``SOURCE_DATE_EPOCH`` as ISO 8601 in UTC, so that outputs can be reproduced.
+
+    None without that variable, or when it is no number of seconds.
+    """
+    try:
+        moment = datetime.fromtimestamp(int(os.environ.get("SOURCE_DATE_EPOCH", "")), UTC)
+    except (ValueError, OverflowError, OSError):
+        return None
+    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def input_fingerprints(alignment: Alignment) -> dict[str, str]:
+    """`fingerprint` of every input by its path.
+
+    Those in ``alignment.extra["fingerprints"]``, taken when the inputs were read, count more than
+    the files as they are now: an edit in place changes one.
+    """
+    taken = alignment.extra.get("fingerprints", {})
+    paths = (*alignment.source_paths, alignment.reference_path)
+    return {path: taken[path] if path in taken else fingerprint(path) for path in paths}
+
+
+def provenance_tags(alignment: Alignment) -> dict[str, str]:
+    """``GEODELREG_*`` tags of a corrected raster; equal inputs and options give equal tags.
+
+    Parameters
+    ----------
+    alignment : Alignment
+
+    Returns
+    -------
+    dict of str to str
+        Sorted by name; input files without their folders.  What is not known has no tag.
+    """
+    correction, accuracy = alignment.correction, alignment.accuracy
+    prints = input_fingerprints(alignment)
+    source = [prints[path] for path in alignment.source_paths]
+    tags = {
+        "VERSION": __version__,
+        "MS": "; ".join(Path(path).name for path in alignment.source_paths),
+        "MS_FINGERPRINT": "; ".join(source) if all(source) else "",
+        "PAN": Path(alignment.reference_path).name,
+        "PAN_FINGERPRINT": prints[alignment.reference_path],
+        "METHOD": alignment.options.method,
+        "MODEL": correction.model,
+        "VERDICT": alignment.verdict.outcome.value,
+        "GEOTRANSFORM_BEFORE": _numbers(correction.original.to_gdal()),
+        "GEOTRANSFORM_AFTER": _numbers(correction.corrected.to_gdal()),
+        "TIE_POINTS": str(accuracy.kept),
+        "CHECK_RMSE_PX": _rounded(accuracy.check_rmse_px),
+        "CHECK_RMSE_M": _rounded(accuracy.check_rmse_m),
+        "CHECK_CE90_PX": _rounded(accuracy.check_ce90_px),
+        "CHECK_CE90_M": _rounded(accuracy.check_ce90_m),
+        "DATE": source_date() or "",
+    }
+    return {f"GEODELREG_{name}": text for name, text in sorted(tags.items()) if text}
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else ""

@@ -1,0 +1,244 @@
+"""The result of an alignment for machines (JSON with a schema) and for people (a few lines)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geodelreg import __version__
+from geodelreg.product.motion import HeaderMotion, header_motion
+from geodelreg.product.provenance import input_fingerprints, source_date
+from geodelreg.types import Alignment, Correction, Grid, Outcome, Status, TiePoints
+
+SCHEMA_VERSION = "1.0"
+
+
+def report_schema() -> dict[str, Any]:
+    """JSON Schema (2020-12) of `report_dict`."""
+    text = files("geodelreg.product").joinpath("schema/report.schema.json").read_text("utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema
+
+
+def report_json(alignment: Alignment, tie_points: bool = False) -> str:
+    """`report_dict` as text: keys sorted, floats exact, unknown values null, no final newline."""
+    report = report_dict(alignment, tie_points)
+    return json.dumps(report, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+
+
+def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any]:
+    """All that `align` found out, refused or not, as plain JSON values.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    tie_points : bool
+        List every tie point, the rejected ones too.
+
+    Returns
+    -------
+    dict
+        Valid under `report_schema`.  Values that are not known (NaN) are None.
+    """
+    report = {
+        "schema_version": SCHEMA_VERSION,
+        "tool": {"name": "geodelreg", "version": __version__},
+        "created": source_date(),
+        "inputs": _inputs(alignment),
+        "correction": _correction(alignment.correction, header_motion(alignment)),
+        "tie_points": _tie_points(alignment.tie_points, tie_points),
+        "step_counts": [
+            {"step": step, "points": count} for step, count in alignment.step_counts.items()
+        ],
+        "accuracy": asdict(alignment.accuracy),
+        "band_weights": dict(alignment.band_weights),
+        "verdict": {
+            "outcome": alignment.verdict.outcome.value,
+            "accepted": alignment.verdict.accepted,
+            "reasons": [asdict(reason) for reason in alignment.verdict.reasons],
+        },
+        "warnings": list(alignment.warnings),
+        "crs_operation": alignment.crs_operation,
+        "options": asdict(alignment.options),
+        "timings_s": dict(alignment.timings_s),
+        "versions": dict(alignment.versions),
+    }
+    plain: dict[str, Any] = _plain(report)
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """Value made of JSON types alone; numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _inputs(alignment: Alignment) -> dict[str, Any]:
+    prints = input_fingerprints(alignment)
+    return {
+        "source": {
+            "files": [_file(path, prints[path]) for path in alignment.source_paths],
+            **_grid(alignment.source),
+        },
+        "reference": {
+            "files": [_file(alignment.reference_path, prints[alignment.reference_path])],
+            **_grid(alignment.reference),
+        },
+    }
+
+
+def _file(path: str, digest: str) -> dict[str, Any]:
+    local = Path(path)
+    size = local.stat().st_size if local.is_file() else None
+    return {"path": path, "size_bytes": size, "fingerprint": digest or None}
+
+
+def _grid(grid: Grid) -> dict[str, Any]:
+    return {
+        "width": grid.shape[1],
+        "height": grid.shape[0],
+        "geotransform": grid.transform.to_gdal(),
+        "crs_wkt": grid.crs_wkt,
+    }
+
+
+def _correction(correction: Correction, motion: HeaderMotion) -> dict[str, Any]:
+    return {
+        "model": correction.model,
+        "crs_wkt": correction.crs_wkt,
+        "original_geotransform": correction.original.to_gdal(),
+        "corrected_geotransform": correction.corrected.to_gdal(),
+        "map_transform": correction.map_transform.to_gdal(),
+        "at_centre": {
+            **asdict(motion),
+            "distance_px": motion.distance_px,
+            "distance_m": motion.distance_m,
+        },
+    }
+
+
+def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
+    counts = np.bincount(points.status, minlength=len(Status))
+    report: dict[str, Any] = {
+        "total": len(points),
+        "check": int(np.count_nonzero(points.is_check & points.kept)),
+        "by_status": {status.name.lower(): counts[status] for status in Status},
+    }
+    if listed:
+        report["points"] = [
+            {
+                "source_px": points.source_px[index],
+                "reference_px": points.reference_px[index],
+                "covariance_px2": points.covariance_px2[index],
+                "score": points.score[index],
+                "status": Status(points.status[index]).name.lower(),
+                "is_check": points.is_check[index],
+                "residual_px": points.residual_px[index],
+            }
+            for index in range(len(points))
+        ]
+    return report
+
+
+def summary_text(alignment: Alignment) -> str:
+    """A few lines for people: what was found, how good it is, what to do next.
+
+    Warnings are not repeated here.
+    """
+    if alignment.verdict.outcome is Outcome.REFUSED:
+        lines = _refused_lines(alignment)
+    else:
+        lines = [_found_line(alignment), _accuracy_line(alignment), _next_line(alignment)]
+    return "\n".join(line for line in lines if line)
+
+
+def _found_line(alignment: Alignment) -> str:
+    motion = header_motion(alignment)
+    if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
+        return "Already aligned: the header needs no correction and stays as it is."
+    off = _with_metres(motion.distance_px, motion.distance_m)
+    (right, down), (width, height) = motion.shift_px, motion.scale
+    parts = [
+        f"{_short(abs(right))} px {'right' if right >= 0 else 'left'}",
+        f"{_short(abs(down))} px {'down' if down >= 0 else 'up'}",
+    ]
+    if alignment.correction.model in ("scale", "similarity", "affine"):
+        parts.append(f"scale × {width:.6f} by × {height:.6f}")
+    if alignment.correction.model in ("similarity", "affine"):
+        parts.append(f"turned {motion.rotation_deg:+.4f}° counterclockwise")
+    if alignment.correction.model == "affine":
+        parts.append(f"shear {motion.shear_deg:+.4f}°")
+    return (
+        f"Aligned: MS was {off} off PAN. At its centre it moves {', '.join(parts)} "
+        f"(model {alignment.correction.model})."
+    )
+
+
+def _accuracy_line(alignment: Alignment) -> str:
+    accuracy = alignment.accuracy
+    if not math.isfinite(accuracy.check_rmse_px):
+        return f"{accuracy.kept} tie points; too few to measure the accuracy on points left out."
+    text = (
+        f"Accuracy at {accuracy.checked} check points: RMSE "
+        f"{_with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)}, CE90 "
+        f"{_with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m)}"
+    )
+    if math.isfinite(accuracy.before_rmse_px):
+        text += f"; before: {_short(accuracy.before_rmse_px)} PAN px"
+    if math.isfinite(accuracy.coverage):
+        text += f". They span {100 * accuracy.coverage:.0f} % of the overlap"
+    return text + "."
+
+
+def _next_line(alignment: Alignment) -> str:
+    if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
+        return "Next: use the raster as it is."
+    original, corrected = alignment.correction.original, alignment.correction.corrected
+    if corrected.b or corrected.d:
+        remedy = "for them add --warp"
+        if not (original.b or original.d):
+            remedy += ", or keep the grid north-up with --model scale"
+        return (
+            "Next: the corrected grid is rotated, which GDAL's pansharpening and gdalbuildvrt "
+            f"refuse: {remedy}."
+        )
+    return "Next: the corrected grid is north-up, ready for pansharpening with PAN."
+
+
+def _refused_lines(alignment: Alignment) -> list[str]:
+    failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
+    tips = (
+        "Next: see that both rasters show the same ground; widen --search-radius when the header "
+        "is further off; try --band with the band that looks most like PAN; mask clouds and water."
+    )
+    return [
+        "Refused: the images do not support an alignment; the header stays as it is.",
+        *(f"  - {message}" for message in failed),
+        tips,
+    ]
+
+
+def _with_metres(px: float, m: float) -> str:
+    return f"{_short(px)} PAN px" + (f" ({_short(m)} m)" if math.isfinite(m) else "")
+
+
+def _short(value: float) -> str:
+    """Three significant digits without an exponent; "unknown" for NaN."""
+    if not math.isfinite(value):
+        return "unknown"
+    digits = 2 - math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{min(max(digits, 0), 4)}f}"
