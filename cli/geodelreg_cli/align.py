@@ -21,7 +21,6 @@ from geodelreg_cli.options import (
     build,
     knob_option,
 )
-from geodelreg_cli.outputs import check_targets, raster_targets
 
 if TYPE_CHECKING:
     from geodelreg.types import Alignment
@@ -210,6 +209,8 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
 
 
 def _check_outputs(request: Request) -> None:
+    from geodelreg_cli.outputs import check_targets, raster_targets
+
     rasters = [] if request.output is None else raster_targets(request.sources, request.output)
     side_files = [*request.gcps, request.report, request.figure]
     targets = [*rasters, *(path for path in side_files if path is not None)]

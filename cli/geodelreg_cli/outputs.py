@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from geodelreg.errors import (
-    OutputExistsError,
-    OutputIsInputError,
-    OutputUnwritableError,
-    UsageError,
-)
+from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.product.atomic import check_not_input, check_replaceable, unwritable
 
 
 def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
@@ -78,42 +75,12 @@ def check_targets(
         if resolved in seen:
             raise UsageError(f"{target} is named for two outputs", "Give each its own name.")
         seen.add(resolved)
-        _check_not_input(inputs, target)
-        _check_absent(target, overwrite)
+        check_not_input(target, map(Path, inputs))
+        check_replaceable(target, overwrite)
         folder = target.absolute().parent
         if created is not None and folder == created.absolute() and not folder.exists():
             folder = folder.parent
-        _check_folder(target, folder)
-
-
-def _check_not_input(inputs: Iterable[str], target: Path) -> None:
-    if any(_same_file(name, target) for name in inputs):
-        raise OutputIsInputError(
-            f"{target} is both input and output",
-            "Choose another name; align --in-place corrects the header of MS itself.",
-        )
-
-
-def _check_absent(target: Path, overwrite: bool) -> None:
-    if target.is_dir():
-        raise OutputUnwritableError(f"{target} is a folder", "Name a file.")
-    if target.exists() and not overwrite:
-        raise OutputExistsError(
-            f"{target} exists", "Add --overwrite to replace it, or choose another name."
-        )
-
-
-def _check_folder(target: Path, folder: Path) -> None:
-    if not folder.is_dir():
-        raise OutputUnwritableError(f"{target}: its folder does not exist", "Create the folder.")
-    if not os.access(folder, os.W_OK):
-        raise OutputUnwritableError(
-            f"{target}: no permission to write to {folder}", "Choose a folder you may write to."
-        )
-
-
-def _same_file(name: str, target: Path) -> bool:
-    try:
-        return target.samefile(name)
-    except (OSError, ValueError):
-        return False
+        if not folder.is_dir():
+            raise unwritable(target, FileNotFoundError(errno.ENOENT, "no such folder"))
+        if not os.access(folder, os.W_OK):
+            raise unwritable(target, PermissionError(errno.EACCES, "permission denied"))

@@ -31,12 +31,12 @@ def folder(tmp_path: Path) -> Path:
         (("-o", "old.tif"), 1, "old.tif exists", "--overwrite"),
         (("-o", "new.tif", "--report", "old.json"), 1, "old.json exists", "--overwrite"),
         (("-o", "new.tif", "--gcps", "sub/../old.json"), 1, "exists", "--overwrite"),
-        (("-o", "ms.tif", "--overwrite"), 2, "ms.tif is both input and output", "--in-place"),
-        (("-o", "sub/../pan.tif", "--overwrite"), 2, "both input and output", "--in-place"),
+        (("-o", "ms.tif", "--overwrite"), 2, "ms.tif is the input ms.tif", "--in-place"),
+        (("-o", "sub/../pan.tif", "--overwrite"), 2, "is the input pan.tif", "--in-place"),
         (("-o", "missing/new.tif"), 1, "its folder does not exist", "Create the folder"),
         (("-o", "old.tif/new.tif"), 1, "its folder does not exist", "Create the folder"),
         (("-o", "sub"), 1, "sub is a folder", "ms.tif"),
-        (("-o", "new.tif", "--figure", "sub"), 1, "sub is a folder", "Name a file"),
+        (("-o", "new.tif", "--figure", "sub"), 1, "sub cannot be written: it is a folder", "Name a file"),
         (("--in-place", "--report", "old.json"), 1, "old.json exists", "--overwrite"),
     ],
 )  # fmt: skip
@@ -96,7 +96,7 @@ def test_overwrite_replaces_files_only(folder: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write")
 def test_a_folder_without_write_permission(folder: Path) -> None:
     (folder / "sub").chmod(0o555)
-    with pytest.raises(OutputUnwritableError, match="no permission"):
+    with pytest.raises(OutputUnwritableError, match="permission denied"):
         check_targets([], [folder / "sub" / "new.tif"], overwrite=False)
 
 
