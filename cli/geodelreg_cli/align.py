@@ -240,6 +240,7 @@ def _check_gcp_formats(request: Request) -> None:
 def _run(request: Request) -> None:
     """Align, then write what was asked for; a refusal leaves the report only."""
     import geodelreg
+    from geodelreg.product.report import report_json, summary_text
 
     source = request.sources[0] if len(request.sources) == 1 else request.sources
     try:
@@ -249,13 +250,12 @@ def _run(request: Request) -> None:
             )
     except AlignmentRefusedError as refusal:
         if refusal.alignment is not None:
-            _report(refusal.alignment, request)
+            _publish_report(report_json(refusal.alignment), request)
         raise
+    report = report_json(alignment)  # of the inputs as they are: --in-place changes one
     _write(alignment, request)
-    _report(alignment, request)
+    _publish_report(report, request)
     if not request.quiet:
-        from geodelreg.product.report import summary_text
-
         click.echo(summary_text(alignment), err=True)
 
 
@@ -263,6 +263,7 @@ def _write(alignment: Alignment, request: Request) -> None:
     """Write the raster first: what it can refuse must leave no side files behind."""
     import geodelreg
 
+    overwrite = request.write_options.overwrite
     warnings: list[str] = []
     if request.in_place:
         warnings = geodelreg.write_in_place(alignment)
@@ -271,22 +272,17 @@ def _write(alignment: Alignment, request: Request) -> None:
     for warning in (*alignment.warnings, *warnings):
         logging.getLogger(__name__).warning("warning: %s", warning)
     for path in request.gcps:
-        geodelreg.export_gcps(
-            alignment, path, request.gcp_format, overwrite=request.write_options.overwrite
-        )
+        geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite=overwrite)
     if request.figure is not None:
         from geodelreg.product.figures import write_figure
 
         write_figure(alignment, request.figure)
 
 
-def _report(alignment: Alignment, request: Request) -> None:
-    if request.report is None and not request.json:
-        return
-    from geodelreg.product.report import report_json
-
-    text = report_json(alignment)
+def _publish_report(text: str, request: Request) -> None:
     if request.report is not None:
-        request.report.write_text(text + "\n", encoding="utf-8")
+        from geodelreg.product.atomic import write_text_atomically
+
+        write_text_atomically(request.report, text + "\n", request.write_options.overwrite)
     if request.json:
         click.echo(text)

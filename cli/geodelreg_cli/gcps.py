@@ -12,7 +12,7 @@ from geodelreg_cli.console import configure_logging
 from geodelreg_cli.options import GCP_FORMAT, SectionCommand
 
 if TYPE_CHECKING:
-    from geodelreg.types import Gcp
+    from geodelreg.types import Gcp, Grid
 
 EPILOG = """\
 Examples:
@@ -67,9 +67,13 @@ def gcps(
     from geodelreg.image.reader import open_raster
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
 
+    def grid(path: str) -> Grid:
+        with open_raster(path) as reader:
+            return reader.grid
+
     context = GcpContext(
-        source=open_raster(raster).grid,
-        reference=None if reference is None else open_raster(reference).grid,
+        source=grid(raster),
+        reference=None if reference is None else grid(reference),
         source_paths=(raster,),
         reference_path=reference or "",
     )

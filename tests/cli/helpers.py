@@ -15,12 +15,13 @@ import rasterio
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "sample_tiles"
 
+COMMAND = (sys.executable, "-m", "geodelreg_cli")
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def run_command(*args: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """``geodelreg ARGS`` with its output captured."""
-    command = [sys.executable, "-m", "geodelreg_cli", *map(str, args)]
+    command = [*COMMAND, *map(str, args)]
     env = os.environ | {"COLUMNS": "100"}
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, timeout=120)
 

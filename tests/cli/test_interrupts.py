@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.helpers import snapshot
+from tests.cli.helpers import COMMAND, snapshot
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/status").exists(), reason="needs /proc to see that handlers are set"
@@ -76,7 +76,17 @@ def test_a_signal_in_mid_work_removes_temporaries(
 def test_align_is_terminated_or_done_never_between(pair: Path, delay_s: float) -> None:
     before = snapshot(pair)
     process = subprocess.Popen(
-        [sys.executable, "-m", "geodelreg_cli", "align", "ms.tif", "pan.tif", "-o", "out.tif", "-q"],
+        [
+            sys.executable,
+            "-m",
+            "geodelreg_cli",
+            "align",
+            "ms.tif",
+            "pan.tif",
+            "-o",
+            "out.tif",
+            "-q",
+        ],
         cwd=pair,
         stderr=subprocess.PIPE,
         text=True,
@@ -99,7 +109,7 @@ def test_a_closed_pipe_is_no_error_message() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     process = subprocess.run(
-        [sys.executable, "-m", "geodelreg_cli", "align", "--help"],
+        [*COMMAND, "align", "--help"],
         stdout=writer,
         stderr=subprocess.PIPE,
         text=True,

@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
         (("-o", "missing/new.tif"), 1, "its folder does not exist", "Create the folder"),
         (("-o", "old.tif/new.tif"), 1, "its folder does not exist", "Create the folder"),
         (("-o", "sub"), 1, "sub is a folder", "ms.tif"),
-        (("-o", "new.tif", "--figure", "sub"), 1, "sub cannot be written: it is a folder", "Name a file"),
+        (("-o", "new.tif", "--figure", "sub"), 1, "sub cannot be written: it is a folder", "file"),
         (("--in-place", "--report", "old.json"), 1, "old.json exists", "--overwrite"),
     ],
 )  # fmt: skip
