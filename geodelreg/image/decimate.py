@@ -39,24 +39,24 @@ class BoxAverage:
         self._sum = np.zeros((bands, height, width))
         self._area = np.zeros((bands, height, width))
 
-    def add(self, data: Float32Array, valid: BoolArray, column: int, row: int) -> None:
+    def add(self, data: Float32Array, valid: BoolArray | None, column: int, row: int) -> None:
         """Add the piece whose upper-left pixel is (`column`, `row`) of the finer raster.
 
         Parameters
         ----------
         data : (B, h, w) float32
-            Finite everywhere; overwritten where `valid` is False.
-        valid : (B, h, w) bool
+            0 where `valid` is False.
+        valid : (B, h, w) bool or None
+            None stands for all valid.
         column, row : int
         """
         rows = _Cells(row, data.shape[1], self._origin[1], self._ratio[1], self._counts[1])
         columns = _Cells(column, data.shape[2], self._origin[0], self._ratio[0], self._counts[0])
         target = (slice(None), rows.cells, columns.cells)
-        if valid.all():
+        if valid is None:
             data_sum = columns.fold(rows.fold(data, 1), 2)
             area = np.multiply.outer(rows.areas(), columns.areas())[None]
         else:
-            data[~valid] = 0
             data_sum = columns.fold(rows.fold(data, 1), 2)
             area = columns.fold(rows.fold(valid.astype(np.float32), 1), 2)
         self._sum[target] += data_sum

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -18,30 +18,21 @@ from geodelreg.errors import (
     BandGridError,
     BandNumberError,
     NoDataError,
-    RasterUnreadableError,
     UsageError,
 )
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.decimate import BoxAverage
 from geodelreg.image.environment import bounded_cache, gdal_calls
-from geodelreg.image.opening import dataset_grid, open_dataset
-from geodelreg.image.validity import alpha_bands, differs_from_nodata, has_mask_band
+from geodelreg.image.raster_file import RasterFile
 from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from rasterio.io import DatasetReader
 
 logger = logging.getLogger(__name__)
 
-_PIECE_PIXELS = 4_000_000
-"""Pixels (of all bands together) that a decimated read holds at a time."""
-
 _EXACT_PIXELS = 16_000_000
 """Windows up to this size are averaged from full resolution, whatever the overviews hold."""
-
-_LARGE_BLOCK_BYTES = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,79 +42,6 @@ class _FileBand:
     file: int
     number: int
     name: str
-
-
-class _File:
-    """One open raster file and, opened on demand, its overviews."""
-
-    def __init__(self, path: str, stack: ExitStack) -> None:
-        self.path = path
-        self.dataset = stack.enter_context(open_dataset(path))
-        self.grid = dataset_grid(path, self.dataset)
-        self._stack = stack
-        self._levels: dict[int, DatasetReader] = {}
-        self._alpha = alpha_bands(self.dataset)
-        self.image_bands = tuple(
-            n for n in range(1, self.dataset.count + 1) if n not in self._alpha
-        )
-
-    def level(self, level: int | None) -> DatasetReader:
-        if level is None:
-            return self.dataset
-        if level not in self._levels:
-            self._levels[level] = self._stack.enter_context(open_dataset(self.path, level))
-        return self._levels[level]
-
-    def overview_factors(self) -> list[float]:
-        """True ratios of sizes, one per overview level that all image bands have."""
-        counts = [len(self.dataset.overviews(n)) for n in self.image_bands]
-        factors = []
-        for level in range(min(counts, default=0)):
-            overview = self.level(level)
-            factors.append(
-                min(self.dataset.width / overview.width, self.dataset.height / overview.height)
-            )
-        return factors
-
-    def pixels(
-        self, numbers: Sequence[int], window: Window, level: int | None = None
-    ) -> tuple[Float32Array, BoolArray]:
-        """Pixels (B, h, w) float32, 0 where invalid, and their validity (B, h, w) bool."""
-        from rasterio.errors import RasterioError
-
-        dataset = self.level(level)
-        bottom, right = window.row + window.height, window.column + window.width
-        area = ((window.row, bottom), (window.column, right))
-        try:
-            with gdal_calls():
-                raw = dataset.read(list(numbers), window=area)
-                masks = [self._mask(dataset, n, area) for n in numbers]
-        except (RasterioError, OSError, MemoryError, ValueError) as error:
-            raise RasterUnreadableError(
-                f"{self.path}: pixels of columns {window.column}–{right}, "
-                f"rows {window.row}–{bottom} cannot be decoded "
-                f"({' '.join(str(error.__cause__ or error).split())})",
-                "The file is truncated or damaged: copy or download it again.",
-            ) from error
-        with np.errstate(over="ignore", invalid="ignore"):
-            data = raw.astype(np.float32)
-        valid = np.isfinite(data) if raw.dtype.kind == "f" else np.ones(data.shape, dtype=np.bool_)
-        for plane, number in enumerate(numbers):
-            differs = differs_from_nodata(raw[plane], dataset.nodatavals[number - 1])
-            for mask in (differs, *masks[plane]):
-                if mask is not None:
-                    valid[plane] &= mask
-        if not valid.all():
-            data[~valid] = 0
-        return data, valid
-
-    def _mask(
-        self, dataset: DatasetReader, number: int, area: tuple[tuple[int, int], tuple[int, int]]
-    ) -> list[BoolArray]:
-        masks = [dataset.read(n, window=area) != 0 for n in self._alpha]
-        if has_mask_band(dataset, number):
-            masks.append(dataset.read_masks(number, window=area) != 0)
-        return masks
 
 
 class RasterReader:
@@ -143,7 +61,7 @@ class RasterReader:
         self._lock = threading.Lock()
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
-            files = [_File(path, stack) for path in paths]
+            files = [RasterFile(path, stack) for path in paths]
             self._files = _on_the_common_grid(files)
             self._stack = stack.pop_all()
         self.paths = tuple(file.path for file in self._files)
@@ -197,18 +115,8 @@ class RasterReader:
 
     @property
     def block_note(self) -> str:
-        """Says so when one block is too large for the file to be read in pieces; else empty."""
-        for file in self._files:
-            height, width = file.dataset.block_shapes[0]
-            planes = file.dataset.count if file.dataset.profile.get("interleave") == "pixel" else 1
-            size = height * width * planes * np.dtype(file.dataset.dtypes[0]).itemsize
-            if size > _LARGE_BLOCK_BYTES:
-                return (
-                    f"{Path(file.path).name} is stored in blocks of {width} × {height} pixels "
-                    f"({size / 1e6:.0f} MB), each of which can only be read whole; "
-                    "a tiled copy needs less memory"
-                )
-        return ""
+        """Says so when one block is too large for a file to be read in pieces; else empty."""
+        return "; ".join(file.block_note for file in self._files if file.block_note)
 
     @property
     def is_single_block(self) -> bool:
@@ -272,21 +180,13 @@ class RasterReader:
             raise ValueError(f"{window} cannot be averaged down to {shape} (height, width)")
 
     def _read_file(
-        self, file: _File, numbers: list[int], window: Window, shape: tuple[int, int]
+        self, file: RasterFile, numbers: list[int], window: Window, shape: tuple[int, int]
     ) -> tuple[Float32Array, BoolArray]:
         if shape == (window.height, window.width):
-            return file.pixels(numbers, window)
-        level = self._best_level(window, shape)
-        dataset = file.level(level)
-        scale = (dataset.width / file.dataset.width, dataset.height / file.dataset.height)
-        origin = (window.column * scale[0], window.row * scale[1])
-        size = (window.width * scale[0], window.height * scale[1])
-        average = BoxAverage(len(numbers), shape, origin, size)
-        for piece in _pieces(dataset, origin, size, len(numbers)):
-            average.add(*file.pixels(numbers, piece, level), piece.column, piece.row)
-        return average.result()
+            return file.read(numbers, window)
+        return file.read_decimated(numbers, window, shape, self._best_overview(window, shape))
 
-    def _best_level(self, window: Window, shape: tuple[int, int]) -> int | None:
+    def _best_overview(self, window: Window, shape: tuple[int, int]) -> int | None:
         if window.width * window.height <= _EXACT_PIXELS:
             return None
         ratio = min(window.width / shape[1], window.height / shape[0]) * (1 + 1e-6)
@@ -294,7 +194,7 @@ class RasterReader:
         return fitting[-1] if fitting else None
 
     def _common_decimations(self) -> tuple[float, ...]:
-        factors = [file.overview_factors() for file in self._files]
+        factors = [file.overview_factors for file in self._files]
         shared = min(factors, key=len)
         same = all(np.allclose(other[: len(shared)], shared) for other in factors)
         return (1.0, *(shared if same else ()))
@@ -304,34 +204,7 @@ def _storage(band: _FileBand) -> tuple[int, int]:
     return band.file, band.number
 
 
-def _pieces(
-    dataset: DatasetReader, origin: tuple[float, float], size: tuple[float, float], bands: int
-) -> list[Window]:
-    """Pieces of whole blocks that cover a window, each of about `_PIECE_PIXELS`."""
-    left, top = int(origin[0] + 1e-6), int(origin[1] + 1e-6)
-    right = min(dataset.width, int(np.ceil(origin[0] + size[0] - 1e-6)))
-    bottom = min(dataset.height, int(np.ceil(origin[1] + size[1] - 1e-6)))
-    block_height, block_width = (int(side) for side in dataset.block_shapes[0])
-    pixels = max(_PIECE_PIXELS // bands, 1)
-    rows = max(pixels // (right - left) // block_height, 1) * block_height
-    rows = min(rows, max(pixels // min(right - left, block_width), 1))
-    columns = max(pixels // rows // block_width, 1) * block_width
-    columns = min(columns, max(pixels // rows, 1))
-    return [
-        Window(x0, y0, x1 - x0, y1 - y0)
-        for y0, y1 in _cuts(top, bottom, rows)
-        for x0, x1 in _cuts(left, right, columns)
-    ]
-
-
-def _cuts(start: int, stop: int, step: int) -> list[tuple[int, int]]:
-    """Cut a range at the multiples of `step`."""
-    inner = range((start // step + 1) * step, stop, step)
-    edges = [start, *inner, stop]
-    return list(pairwise(edges))
-
-
-def _on_the_common_grid(files: list[_File]) -> list[_File]:
+def _on_the_common_grid(files: list[RasterFile]) -> list[RasterFile]:
     """Files on the grid that most of them share; on a tie the finest."""
     from rasterio.crs import CRS
 
@@ -344,7 +217,7 @@ def _on_the_common_grid(files: list[_File]) -> list[_File]:
                     f"{first.path} and {file.path} have different coordinate reference systems",
                     "Bands of one image share one; align images with different ones separately.",
                 )
-    groups: list[list[_File]] = []
+    groups: list[list[RasterFile]] = []
     for file in files:
         group = next((g for g in groups if _same_grid(g[0].grid, file.grid)), None)
         if group is None:
@@ -364,7 +237,7 @@ def _same_grid(one: Grid, other: Grid) -> bool:
     return all(np.hypot(*np.subtract(offset @ corner, corner)) <= 1e-3 for corner in corners)
 
 
-def _list_bands(files: list[_File]) -> list[_FileBand]:
+def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
     bands = []
     for index, file in enumerate(files):
         for number in file.image_bands:

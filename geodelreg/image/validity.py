@@ -32,8 +32,10 @@ def has_mask_band(dataset: DatasetReader, band: int) -> bool:
     """Whether the file has a mask of its own (internal or ``.msk``) for this band."""
     from rasterio.enums import MaskFlags
 
-    flags = dataset.mask_flag_enums[band - 1]
-    return not {MaskFlags.all_valid, MaskFlags.nodata, MaskFlags.alpha} & set(flags)
+    flags = set(dataset.mask_flag_enums[band - 1])
+    if MaskFlags.alpha in flags:
+        return False
+    return MaskFlags.per_dataset in flags or not flags
 
 
 def differs_from_nodata(data: NDArray[Any], nodata: float | None) -> BoolArray | None:

@@ -1,0 +1,243 @@
+"""One open raster file: its image bands, its overviews, and pixels with their validity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.errors import RasterUnreadableError
+from geodelreg.image.decimate import BoxAverage
+from geodelreg.image.environment import gdal_calls
+from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.image.overviews import Placement, find_placement
+from geodelreg.image.validity import alpha_bands, differs_from_nodata, has_mask_band
+from geodelreg.types import BoolArray, Float32Array, Window
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+_PIECE_PIXELS = 2_000_000
+"""Pixels (of all bands together) that a decimated read holds at a time."""
+
+_LARGE_BLOCK_BYTES = 64_000_000
+
+
+class RasterFile:
+    """A raster file that passed all checks.
+
+    Parameters
+    ----------
+    path : str
+    stack : ExitStack
+        Closes the file, and its overviews when they were needed.
+
+    Attributes
+    ----------
+    grid : Grid
+    image_bands : tuple of int
+        1-based numbers of the bands that are not alpha.
+
+    Raises
+    ------
+    RasterNotFoundError, RasterUnreadableError, MissingGeoreferenceError
+    UnsupportedGeoreferenceError, MissingCrsError
+    """
+
+    def __init__(self, path: str, stack: ExitStack) -> None:
+        self.path = path
+        self.dataset = stack.enter_context(open_dataset(path))
+        self.grid = dataset_grid(path, self.dataset)
+        self._stack = stack
+        self._alpha = alpha_bands(self.dataset)
+        self.image_bands = tuple(
+            n for n in range(1, self.dataset.count + 1) if n not in self._alpha
+        )
+        self._placements: dict[int, Placement] = {}
+
+    @cached_property
+    def _overviews(self) -> tuple[DatasetReader, ...]:
+        with gdal_calls():
+            count = min(len(self.dataset.overviews(n)) for n in range(1, self.dataset.count + 1))
+        return tuple(
+            self._stack.enter_context(open_dataset(self.path, index)) for index in range(count)
+        )
+
+    @property
+    def overview_factors(self) -> tuple[float, ...]:
+        """True ratios of sizes, finest level first."""
+        height, width = self.grid.shape
+        return tuple(min(width / one.width, height / one.height) for one in self._overviews)
+
+    @property
+    def block_note(self) -> str:
+        """Says so when one block is too large for the file to be read in pieces; else empty."""
+        height, width = self.dataset.block_shapes[0]
+        planes = self.dataset.count if self.dataset.profile.get("interleave") == "pixel" else 1
+        size = height * width * planes * np.dtype(self.dataset.dtypes[0]).itemsize
+        if size <= _LARGE_BLOCK_BYTES:
+            return ""
+        return (
+            f"{Path(self.path).name} is stored in blocks of {width} × {height} pixels "
+            f"({size / 1e6:.0f} MB), each of which can only be read whole; "
+            "a tiled copy (gdal_translate -co TILED=YES) needs less memory"
+        )
+
+    def read(self, numbers: Sequence[int], window: Window) -> tuple[Float32Array, BoolArray]:
+        """Pixels of a window.
+
+        Parameters
+        ----------
+        numbers : sequence of int
+            GDAL's band numbers, from 1.
+        window : Window
+
+        Returns
+        -------
+        (B, h, w) float32
+            0 where invalid.
+        (B, h, w) bool
+
+        Raises
+        ------
+        RasterUnreadableError
+        """
+        data, valid = self._pixels(numbers, window, self.dataset)
+        return data, np.ones(data.shape, dtype=np.bool_) if valid is None else valid
+
+    def read_decimated(
+        self, numbers: Sequence[int], window: Window, shape: tuple[int, int], overview: int | None
+    ) -> tuple[Float32Array, BoolArray]:
+        """Pixels of a window, averaged down to `shape` from an overview or from the full raster.
+
+        Only a piece is in memory at a time.  Parameters and returned values as in `read`.
+        """
+        if overview is None:
+            dataset, placement = self.dataset, Placement((1.0, 1.0))
+        else:
+            dataset, placement = self._overviews[overview], self._placement(overview)
+        origin, size = placement.area(window)
+        average = BoxAverage(len(numbers), shape, origin, size)
+        for piece in _pieces(dataset, origin, size, len(numbers)):
+            average.add(*self._pixels(numbers, piece, dataset), piece.column, piece.row)
+        return average.result()
+
+    def _placement(self, overview: int) -> Placement:
+        """Where an overview's pixels lie, found on first use."""
+        if overview not in self._placements:
+            dataset, number = self._overviews[overview], self.image_bands[0]
+
+            def read_patch(of_overview: bool, window: Window) -> tuple[Float32Array, BoolArray]:
+                level = dataset if of_overview else self.dataset
+                data, valid = self._pixels([number], window, level)
+                return data, np.ones(data.shape, dtype=np.bool_) if valid is None else valid
+
+            shape = (dataset.height, dataset.width)
+            self._placements[overview] = find_placement(read_patch, shape, self.grid.shape)
+        return self._placements[overview]
+
+    def _pixels(
+        self, numbers: Sequence[int], window: Window, level: DatasetReader
+    ) -> tuple[Float32Array, BoolArray | None]:
+        """Pixels of one level, 0 where invalid, and their validity; None stands for all valid."""
+        from rasterio.errors import RasterioError
+
+        try:
+            with gdal_calls():
+                raw = level.read(list(numbers), window=_slices(window))
+                masks = self._masks(numbers, window, level)
+        except (RasterioError, OSError, MemoryError, ValueError) as error:
+            reason = " ".join(str(error.__cause__ or error).split())
+            raise RasterUnreadableError(
+                f"{self.path}: the pixels of columns {window.column} to "
+                f"{window.column + window.width}, rows {window.row} to "
+                f"{window.row + window.height} cannot be decoded ({reason})",
+                "The file is truncated or damaged: copy or download it again.",
+            ) from error
+        with np.errstate(over="ignore", invalid="ignore"):
+            data = raw.astype(np.float32)
+        nodata = [level.nodatavals[number - 1] for number in numbers]
+        valid = _validity(raw, data, nodata, masks)
+        if valid is not None:
+            data[~valid] = 0
+        return data, valid
+
+    def _masks(
+        self, numbers: Sequence[int], window: Window, level: DatasetReader
+    ) -> list[tuple[slice | int, BoolArray]]:
+        """Masks of the file, each with the planes that it applies to."""
+        masks: list[tuple[slice | int, BoolArray]] = [
+            (slice(None), level.read(number, window=_slices(window)) != 0) for number in self._alpha
+        ]
+        for plane, number in enumerate(numbers):
+            if has_mask_band(self.dataset, number):
+                masks.append((plane, self._own_mask(number, window, level) != 0))
+        return masks
+
+    def _own_mask(self, number: int, window: Window, level: DatasetReader) -> NDArray[np.uint8]:
+        if level is self.dataset:
+            return np.asarray(self.dataset.read_masks(number, window=_slices(window)))
+        # an overview without a mask of its own claims to be valid everywhere: ask the full raster
+        down, across = self.dataset.height / level.height, self.dataset.width / level.width
+        area = (
+            (window.row * down, (window.row + window.height) * down),
+            (window.column * across, (window.column + window.width) * across),
+        )
+        shape = (window.height, window.width)
+        return np.asarray(self.dataset.read_masks(number, window=area, out_shape=shape))
+
+
+def _validity(
+    raw: NDArray[Any],
+    data: Float32Array,
+    nodata: Sequence[float | None],
+    masks: Sequence[tuple[slice | int, BoolArray]],
+) -> BoolArray | None:
+    """Everything that speaks against a pixel; None when nothing can."""
+    differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
+    if raw.dtype.kind in "iu" and not masks and all(mask is None for mask in differing):
+        return None
+    valid = np.isfinite(data)
+    for plane, mask in [*enumerate(differing), *masks]:
+        if mask is not None:
+            valid[plane] &= mask
+    return None if valid.all() else valid
+
+
+def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (
+        (window.row, window.row + window.height),
+        (window.column, window.column + window.width),
+    )
+
+
+def _pieces(
+    dataset: DatasetReader, origin: tuple[float, float], size: tuple[float, float], bands: int
+) -> list[Window]:
+    """Pieces of whole blocks that cover an area, each of about `_PIECE_PIXELS`."""
+    left, top = (max(int(np.floor(edge + 1e-6)), 0) for edge in origin)
+    right = min(dataset.width, int(np.ceil(origin[0] + size[0] - 1e-6)))
+    bottom = min(dataset.height, int(np.ceil(origin[1] + size[1] - 1e-6)))
+    block_height, block_width = (int(side) for side in dataset.block_shapes[0])
+    pixels = max(_PIECE_PIXELS // bands, 1)
+    rows = max(pixels // (right - left) // block_height, 1) * block_height
+    rows = min(rows, max(pixels // min(right - left, block_width), 1))
+    columns = max(pixels // rows // block_width, 1) * block_width
+    columns = min(columns, max(pixels // rows, 1))
+    return [
+        Window(x0, y0, x1 - x0, y1 - y0)
+        for y0, y1 in _cuts(top, bottom, rows)
+        for x0, x1 in _cuts(left, right, columns)
+    ]
+
+
+def _cuts(start: int, stop: int, step: int) -> list[tuple[int, int]]:
+    """Cut a range at the multiples of `step`."""
+    edges = [start, *range((start // step + 1) * step, stop, step), stop]
+    return list(pairwise(edges))
