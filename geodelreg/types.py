@@ -23,6 +23,7 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
+StatusArray = NDArray[np.uint8]
 
 
 class Window(NamedTuple):
@@ -186,7 +187,7 @@ class TiePoints:
     reference_px: FloatArray
     covariance_px2: FloatArray
     score: FloatArray
-    status: NDArray[np.uint8]
+    status: StatusArray
     is_check: BoolArray
     residual_px: FloatArray
 

@@ -1,0 +1,200 @@
+"""Weighted robust least squares: tie points with covariances to a transformation with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fit.models import PARAMETER_COUNT, Frame, Transformation, design, transformation
+from geodelreg.types import BoolArray, FloatArray
+
+_MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
+_STUDENT_DOF = 6.0
+_REJECT_D2 = 25.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Point pairs to fit, in source pixels.
+
+    Attributes
+    ----------
+    source, target : (N, 2) float64
+        Source pixel, and the header pixel where its content lies.
+    covariance : (N, 2, 2) float64
+        Of `target`, in source pixels squared.
+    """
+
+    source: FloatArray
+    target: FloatArray
+    covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def take(self, keep: BoolArray) -> Observations:
+        """The pairs where `keep` is True."""
+        return Observations(self.source[keep], self.target[keep], self.covariance[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """A fitted transformation.
+
+    Attributes
+    ----------
+    transformation : Transformation
+        Source pixels to header pixels.
+    parameters : (k,) float64
+    covariance : (k, k) float64
+        Of the parameters, from the residuals' real spread.
+    frame : Frame
+    extra_variance_px2 : float
+        Spread of the tie points beyond their own covariances (terrain, parallax), per axis.
+    inlier : (N,) bool
+    distance2 : (N,) float64
+        Squared Mahalanobis distance of each residual.
+    """
+
+    transformation: Transformation
+    parameters: FloatArray
+    covariance: FloatArray
+    frame: Frame
+    extra_variance_px2: float
+    inlier: BoolArray
+    distance2: FloatArray
+
+    def sigma_at(self, xy: FloatArray) -> FloatArray:
+        """(N,) standard error (radial, source pixels) of the transformation at (N, 2) pixels."""
+        columns, _ = design(self.transformation.model, xy, self.frame)
+        spread = np.einsum("nik,kl,nil->n", columns, self.covariance, columns)
+        return np.sqrt(np.maximum(spread, 0)) * self.frame.span_px
+
+
+def minimum_points(model: str) -> int:
+    """Fewest points that determine a model with one to spare."""
+    return PARAMETER_COUNT[model] // 2 + 1
+
+
+def weighted_fit(
+    model: str, points: Observations, weight: FloatArray, frame: Frame
+) -> tuple[FloatArray, FloatArray]:
+    """Parameters and normal matrix of one weighted least-squares fit.
+
+    Parameters
+    ----------
+    model : str
+    points : Observations
+    weight : (N, 2, 2) float64
+        Inverse covariances, in source pixels.
+    frame : Frame
+
+    Returns
+    -------
+    parameters : (k,) float64
+    normal : (k, k) float64
+    """
+    columns, base = design(model, points.source, frame)
+    right = frame.normalise(points.target) - base
+    weighted = np.matmul(weight * frame.span_px**2, columns)
+    normal = np.einsum("nik,nil->kl", columns, weighted)
+    moment = np.einsum("nik,ni->k", weighted, right)
+    return np.linalg.lstsq(normal, moment, rcond=1e-13)[0], normal
+
+
+def robust_fit(
+    model: str, points: Observations, frame: Frame, extra_variance_px2: float | None = None
+) -> Estimate:
+    """Fit by iteratively reweighted least squares with Student weights.
+
+    The tie points' own covariances are enlarged by a common variance until the median residual is
+    what they promise (DerSimonian & Laird's idea, by the median): terrain and parallax are real.
+
+    Parameters
+    ----------
+    model : str
+        One of `geodelreg.fit.models.MODEL_ORDER`.
+    points : Observations
+    frame : Frame
+    extra_variance_px2 : float, optional
+        Take this common variance instead of estimating it.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    ValueError
+        With fewer points than parameters need.
+    """
+    if len(points) < minimum_points(model):
+        raise ValueError(f"{len(points)} points cannot determine a {model}")
+    extra = extra_variance_px2 or 0.0
+    student = np.ones(len(points))
+    previous = None
+    for _ in range(30):
+        inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
+        parameters, normal = weighted_fit(model, points, inverse * student[:, None, None], frame)
+        residual = transformation(model, parameters, frame).residuals(points.source, points.target)
+        if extra_variance_px2 is None:
+            extra = common_variance(residual, points.covariance)
+            inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
+        distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
+        student = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
+        if previous is not None and np.abs(parameters - previous).max() < 1e-10:
+            break
+        previous = parameters
+    inlier = distance2 < _REJECT_D2
+    sandwich = _sandwich(model, points, inverse * student[:, None, None], residual, normal, frame)
+    return Estimate(
+        transformation(model, parameters, frame),
+        parameters, sandwich, frame, extra, inlier, distance2,
+    )  # fmt: skip
+
+
+def _sandwich(
+    model: str,
+    points: Observations,
+    weight: FloatArray,
+    residual: FloatArray,
+    normal: FloatArray,
+    frame: Frame,
+) -> FloatArray:
+    """Covariance of the parameters from the residuals themselves (Huber–White, HC1)."""
+    columns, _ = design(model, points.source, frame)
+    score = np.einsum("nik,nij,nj->nk", columns, weight, residual) * frame.span_px
+    spare = max(2 * len(points) - PARAMETER_COUNT[model], 1)
+    middle = score.T @ score * (2 * len(points) / spare)
+    bread = np.linalg.pinv(normal, hermitian=True)
+    return np.asarray(bread @ middle @ bread)
+
+
+def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
+    """Variance per axis to add to every covariance so that the median distance is that of χ²(2).
+
+    Parameters
+    ----------
+    residual : (N, 2) float64
+    covariance : (N, 2, 2) float64
+
+    Returns
+    -------
+    float
+        0 when the covariances already explain the residuals.
+    """
+
+    variances, axes = np.linalg.eigh(covariance)
+    along2 = np.einsum("nji,nj->ni", axes, residual) ** 2
+
+    def median_at(extra: float) -> float:
+        return float(np.median((along2 / (variances + extra)).sum(axis=1)))
+
+    if median_at(0.0) <= _MEDIAN_CHI2_2:
+        return 0.0
+    low, high = 0.0, float(np.median((residual**2).sum(axis=1)) + 1e-12)
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if median_at(middle) > _MEDIAN_CHI2_2 else (low, middle)
+    return high

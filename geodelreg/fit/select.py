@@ -1,0 +1,142 @@
+"""Held-out errors, and the simplest model that they do not reject."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit, weighted_fit
+from geodelreg.fit.models import MODEL_ORDER, Frame, transformation
+from geodelreg.types import FloatArray, IntArray
+
+FOLDS = 5
+_BLOCKS = 8
+_SIGNIFICANT_T = 2.5
+_CAP_D2 = 25.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Errors at points that the predicting fit has not seen.
+
+    Attributes
+    ----------
+    residual_px : (N, 2) float64
+        Source pixels; NaN where a fold left too few points.
+    distance2 : (N,) float64
+        Squared Mahalanobis distance, capped, so that one outlier does not decide.
+    """
+
+    residual_px: FloatArray
+    distance2: FloatArray
+
+
+def spatial_blocks(xy: FloatArray, per_axis: int = _BLOCKS) -> IntArray:
+    """(N,) block number of each point on a `per_axis` × `per_axis` grid over their extent."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    cell = np.floor((xy - low) / np.maximum(high - low, 1e-9) * per_axis * (1 - 1e-9))
+    return np.asarray(cell[:, 1] * per_axis + cell[:, 0], dtype=np.intp)
+
+
+def fold_numbers(xy: FloatArray) -> IntArray:
+    """(N,) fold 0 … 4 of each point: whole blocks, spread like a knight's moves.
+
+    Neighbouring tie points share errors (terrain, parallax); holding out whole blocks keeps the
+    check points independent of the fit.
+    """
+    block = spatial_blocks(xy)
+    return np.asarray((block % _BLOCKS + 2 * (block // _BLOCKS)) % FOLDS, dtype=np.intp)
+
+
+def held_out(model: str, points: Observations, estimate: Estimate) -> HeldOut:
+    """Predict every point by a fit without its fold.
+
+    Parameters
+    ----------
+    model : str
+    points : Observations
+    estimate : Estimate
+        Of all points; gives the weights, so that a fold needs one linear solution.
+    """
+    frame = estimate.frame
+    inverse = np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
+    student = 8.0 / (6.0 + estimate.distance2)
+    weight = inverse * (student * estimate.inlier)[:, None, None]
+    folds = fold_numbers(points.source)
+    residual = np.full((len(points), 2), np.nan)
+    for fold in range(FOLDS):
+        out = folds == fold
+        rest = ~out & estimate.inlier
+        if not out.any() or rest.sum() < minimum_points(model):
+            continue
+        parameters, _ = weighted_fit(model, points.take(rest), weight[rest], frame)
+        predicted = transformation(model, parameters, frame)
+        residual[out] = predicted.residuals(points.source[out], points.target[out])
+    distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
+    return HeldOut(residual, np.minimum(distance2, _CAP_D2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The chosen model, with what decided.
+
+    Attributes
+    ----------
+    estimate : Estimate
+    check : HeldOut
+    t_values : dict of str to float
+        Per model: how many standard errors its held-out error lies above the affine's.
+    """
+
+    estimate: Estimate
+    check: HeldOut
+    t_values: dict[str, float]
+
+
+def select_model(
+    points: Observations, frame: Frame, corners: FloatArray, model: str, negligible_px: float
+) -> Selection:
+    """Fit one model, or choose the simplest whose held-out error is not significantly worse.
+
+    Parameters
+    ----------
+    points : Observations
+    frame : Frame
+    corners : (4, 2) float64
+        Corners of the source raster, pixels.
+    model : str
+        A model's name, or ``auto``.
+    negligible_px : float
+        Models that nowhere differ by more than this many source pixels count as equal.
+    """
+    if model != "auto":
+        estimate = robust_fit(model, points, frame)
+        return Selection(estimate, held_out(model, points, estimate), {})
+    candidates = [name for name in MODEL_ORDER if len(points) >= minimum_points(name)]
+    full = robust_fit(candidates[-1], points, frame)
+    check_full = held_out(candidates[-1], points, full)
+    blocks = spatial_blocks(points.source)
+    t_values: dict[str, float] = {}
+    for name in candidates[:-1]:
+        estimate = robust_fit(name, points, frame, extra_variance_px2=full.extra_variance_px2)
+        check = held_out(name, points, estimate)
+        difference = estimate.transformation(corners) - full.transformation(corners)
+        t_values[name] = _paired_t(check.distance2 - check_full.distance2, blocks)
+        apart = float(np.abs(difference).max())
+        if t_values[name] < _SIGNIFICANT_T or apart < negligible_px:
+            estimate = robust_fit(name, points, frame)
+            return Selection(estimate, held_out(name, points, estimate), t_values)
+    return Selection(full, check_full, t_values)
+
+
+def _paired_t(difference: FloatArray, blocks: IntArray) -> float:
+    """t of the mean of per-block means, blocks being the independent units."""
+    good = np.isfinite(difference)
+    number = np.bincount(blocks[good])
+    total = np.bincount(blocks[good], weights=difference[good])
+    means = total[number > 0] / number[number > 0]
+    if len(means) < 3:
+        return float("inf") if difference[good].mean() > 0 else 0.0
+    spread = means.std(ddof=1) / np.sqrt(len(means))
+    return float(means.mean() / max(spread, 1e-12))

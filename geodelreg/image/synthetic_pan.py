@@ -1,0 +1,223 @@
+"""A synthetic PAN: non-negative weights of the MS bands that best reproduce the low-passed PAN."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.types import Band, BoolArray, Float32Array, FloatArray
+
+_ROUNDS = 12
+_TUKEY = 3.0
+_TUKEY_WIDE = 4.0
+_MAX_CURVED_BANDS = 6
+_WORTHWHILE = 0.97
+
+
+def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
+    """Minimise ``w' G w − 2 m' w`` over w ≥ 0 by an active set (Lawson & Hanson 1974).
+
+    Parameters
+    ----------
+    gram : (B, B) float64
+        Positive semi-definite.
+    moment : (B,) float64
+    """
+    count = len(moment)
+    weights, passive = np.zeros(count), np.zeros(count, dtype=bool)
+    ridge = gram + np.eye(count) * 1e-9 * max(float(np.trace(gram)), 1e-30) / count
+    for _ in range(3 * count):
+        slope = moment - ridge @ weights
+        slope[passive] = -np.inf
+        best = int(np.argmax(slope))
+        if passive.all() or slope[best] <= 1e-9 * float(np.abs(moment).max() + 1e-30):
+            break
+        passive[best] = True
+        while True:
+            trial = np.zeros(count)
+            trial[passive] = np.linalg.solve(ridge[np.ix_(passive, passive)], moment[passive])
+            if (trial[passive] > 0).all():
+                weights = trial
+                break
+            shrink = passive & (trial <= 0)
+            step = np.min(weights[shrink] / np.maximum(weights[shrink] - trial[shrink], 1e-30))
+            weights = weights + step * (trial - weights)
+            passive &= weights > 1e-12 * max(float(weights.max()), 1e-30)
+            weights[~passive] = 0.0
+            if not passive.any():
+                return weights
+    return weights
+
+
+def robust_band_weights(bands: Float32Array, target: Float32Array) -> tuple[FloatArray, float]:
+    """Weights of the bands, robust against clouds and changed pixels.
+
+    Iteratively reweighted (Tukey's biweight) non-negative least squares with a free constant,
+    started from the least absolute deviations.
+
+    Parameters
+    ----------
+    bands : (B, N) float32
+        MS pixels.
+    target : (N,) float32
+        The low-passed PAN at the same places.
+
+    Returns
+    -------
+    weights : (B,) float64
+        All zero when no band has a positive relation to the target.
+    correlation : float
+        Weighted correlation of the combination with the target; 0 when all weights are zero.
+    """
+    x, y = bands.astype(np.float64), target.astype(np.float64)
+    trust = np.ones(y.shape)
+    weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
+    for round_number in range(_ROUNDS):
+        total = max(float(trust.sum()), 1e-30)
+        x0 = x - (x * trust).sum(axis=1, keepdims=True) / total
+        y0 = y - float((y * trust).sum()) / total
+        gram, moment = (x0 * trust) @ x0.T, (x0 * trust) @ y0
+        weights = non_negative_weights(gram, moment)
+        energy = float(weights @ gram @ weights)
+        if energy <= 0:
+            return np.zeros(len(x)), 0.0
+        correlation = float(weights @ moment) / np.sqrt(energy * float((trust * y0) @ y0))
+        residual = np.abs(y0 - weights @ x0)
+        if round_number < _ROUNDS // 2:
+            trust = 1.0 / np.maximum(residual, 1e-3 * float(y0.std()) + 1e-30)
+            scale = 1.4826 * float(np.median(residual))
+            continue
+        scale = min(scale, 1.4826 * float(np.median(residual)))
+        trust = np.clip(1 - (residual / (_TUKEY * scale + 1e-30)) ** 2, 0, None) ** 2
+        if trust.sum() < 16:
+            break
+    return weights, correlation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticPan:
+    """How the MS bands become an image that looks like PAN.
+
+    Attributes
+    ----------
+    weights : (B,) float64
+        Non-negative linear weights.
+    centre, spread, low, high : (B,) float64
+        Of the bands: standardisation and range of the curvature terms.
+    curvature : (B (B + 1) / 2,) float64
+        Weights of the products of standardised bands; zero where linear weights suffice.
+    correlation : float
+        With the low-passed PAN, robustly weighted.
+    """
+
+    weights: FloatArray
+    centre: FloatArray
+    spread: FloatArray
+    low: FloatArray
+    high: FloatArray
+    curvature: FloatArray
+    correlation: float
+
+    def __call__(self, bands: list[Band]) -> Band:
+        """Combine bands of one grid; valid where every band with a weight is."""
+        used = np.flatnonzero((self.weights != 0) | self._curved())
+        data = np.zeros(bands[0].data.shape, dtype=np.float32)
+        valid = np.ones(bands[0].data.shape, dtype=bool)
+        for b in used:
+            data += np.float32(self.weights[b]) * bands[b].data
+            valid &= bands[b].valid
+        if self.curvature.any():
+            stack = np.stack([band.data for band in bands])
+            for term, weight in zip(self._products(stack), self.curvature, strict=True):
+                data += np.float32(weight) * term
+        return Band(data, valid, bands[0].grid, "synthetic PAN")
+
+    def _curved(self) -> BoolArray:
+        return np.full(len(self.weights), bool(self.curvature.any()))
+
+    def _products(self, stack: Float32Array) -> Iterator[Float32Array]:
+        yield from _products(stack, self.centre, self.spread, self.low, self.high)
+
+
+def _products(
+    stack: Float32Array, centre: FloatArray, spread: FloatArray, low: FloatArray, high: FloatArray
+) -> Iterator[Float32Array]:
+    z = [
+        np.asarray((np.clip(values, lo, hi) - mid) / width, dtype=np.float32)
+        for values, lo, hi, mid, width in zip(stack, low, high, centre, spread, strict=True)
+    ]
+    for i, first in enumerate(z):
+        for second in z[i:]:
+            yield first * second
+
+
+def single_band(count: int, index: int) -> SyntheticPan:
+    """One band as it is."""
+    weights = np.zeros(count)
+    weights[index] = 1.0
+    ones, zeros = np.ones(count), np.zeros(count)
+    return SyntheticPan(
+        weights, zeros, ones, zeros, ones, np.zeros(count * (count + 1) // 2), float("nan")
+    )
+
+
+def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan | None:
+    """Fit linear weights robustly, then the curvature that the bands' different tones need.
+
+    A sensor's bands and its PAN differ in gain and tone; with linear weights alone, what curvature
+    is left over pulls the match towards single bands.  Curvature is kept only when it explains
+    held-out samples better.
+
+    Parameters
+    ----------
+    bands : (B, N) float32
+    target : (N,) float32
+        The low-passed PAN at the same places.
+
+    Returns
+    -------
+    SyntheticPan or None
+        None when no band has a positive relation to the target.
+    """
+    weights, correlation = robust_band_weights(bands, target)
+    if not weights.any():
+        return None
+    stack = bands.astype(np.float64)
+    low, high = np.percentile(stack, [0.2, 99.8], axis=1)
+    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), 1e-9)
+    left = target - weights @ stack
+    terms = np.stack([np.ones(len(target)), *_products(bands, centre, spread, low, high)], axis=1)
+    linear = (stack - centre[:, None]) / spread[:, None]
+    design = np.column_stack([terms, linear.T]) if _MAX_CURVED_BANDS >= len(bands) else terms[:, :1]
+    train = np.arange(len(target)) % 2 == 0
+    before = _robust_spread((left - np.median(left[train]))[~train])
+    fitted = _tukey_fit(design[train], left[train])
+    after = _robust_spread((left - design @ fitted)[~train])
+    curvature = np.zeros(len(bands) * (len(bands) + 1) // 2)
+    if after < _WORTHWHILE * before:
+        fitted = _tukey_fit(design, left)
+        steeper = weights + fitted[1 + len(curvature) :] / spread
+        if (steeper < 0).any():
+            return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
+        curvature, weights = fitted[1 : 1 + len(curvature)], steeper
+    return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
+
+
+def _robust_spread(values: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
+    """Least squares by Tukey's biweight from the median absolute residual, a little ridge."""
+    ridge = np.eye(design.shape[1]) * 1e-6 * len(target)
+    trust = np.clip(1 - (target / (_TUKEY_WIDE * _robust_spread(target) + 1e-30)) ** 2, 0, None)
+    fitted = np.zeros(design.shape[1])
+    for _ in range(6):
+        weighted = design * trust[:, None]
+        fitted = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ target)
+        residual = target - design @ fitted
+        scale = _robust_spread(residual)
+        trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + 1e-30)) ** 2, 0, None) ** 2
+    return fitted

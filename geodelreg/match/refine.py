@@ -1,0 +1,260 @@
+"""Sub-pixel refinement: least-squares matching of many small patches at once.
+
+Each patch of the coarser image (the template) is compared with the finer image, low-passed to the
+template's resolution and sampled through the current transformation.  Gain and offset are free, so
+that radiometry does not matter; Gauss–Newton gives displacement and covariance (Gruen 1985;
+Ackermann 1984; with the linear regression form, template noise alone enters the residuals).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.geo.crs import linearise
+from geodelreg.geo.pixel import HALF_PIXEL
+from geodelreg.match.surface import Surface, sample
+from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
+
+_MARGIN = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """How patches are matched.
+
+    Attributes
+    ----------
+    size : int
+        Side of a patch, in template pixels.
+    iterations : int
+        Gauss–Newton steps at most.
+    max_move : float
+        A patch that moves further than this, in template pixels, has not converged.
+    tolerance : float
+        Steps below this, in template pixels, are converged.
+    min_valid : float
+        Least share of usable pixels in a patch.
+    min_correlation : float
+        Least absolute correlation after matching.
+    max_sigma : float
+        Largest standard error along the worse axis, in template pixels.
+    """
+
+    size: int = 20
+    iterations: int = 4
+    max_move: float = 1.5
+    tolerance: float = 0.01
+    min_valid: float = 0.6
+    min_correlation: float = 0.5
+    max_sigma: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Template patches, ready to be matched.
+
+    Attributes
+    ----------
+    centre : (P, 2) float64
+        Template raster pixels, outer corner.
+    values : (P, n * n) float32
+    valid : (P, n * n) bool
+    step : (2,) float64
+        Template raster pixels per patch pixel along columns and rows (1 unless decimated).
+    size : int
+        n.
+    """
+
+    centre: FloatArray
+    values: Float32Array
+    valid: BoolArray
+    step: FloatArray
+    size: int
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """What least-squares matching found, one row per patch.
+
+    Attributes
+    ----------
+    template_px : (P, 2) float64
+        Patch centres.
+    surface_px : (P, 2) float64
+        Matching positions in the finer image, full-raster pixels.
+    covariance_px2 : (P, 2, 2) float64
+        Of `surface_px`.
+    correlation : (P,) float64
+        Of patch and image at the end; negative where contrast is inverted.
+    status : (P,) uint8
+        `Status` code.
+    """
+
+    template_px: FloatArray
+    surface_px: FloatArray
+    covariance_px2: FloatArray
+    correlation: FloatArray
+    status: StatusArray
+
+
+def cut_patches(band: Band, full: Grid, size: int, origins: np.ndarray | None = None) -> Patches:
+    """Cut a band into a grid of adjoining patches.
+
+    Parameters
+    ----------
+    band : Band
+        A window of the template raster, maybe decimated.
+    full : Grid
+        Grid of the full template raster.
+    size : int
+        Side in pixels of `band`.
+    origins : (P, 2) int, optional
+        Upper-left (column, row) of each patch; by default adjoining patches that fill the band.
+    """
+    height, width = band.data.shape
+    if origins is None:
+        rows, columns = height // size, width // size
+        top, left = (height - rows * size) // 2, (width - columns * size) // 2
+        grid_y, grid_x = np.mgrid[0:rows, 0:columns]
+        origins = np.stack([left + grid_x.ravel() * size, top + grid_y.ravel() * size], axis=1)
+    views = np.lib.stride_tricks.sliding_window_view
+    take = (origins[:, 1], origins[:, 0])
+    values = views(band.data, (size, size))[take].reshape(len(origins), -1)
+    valid = views(band.valid, (size, size))[take].reshape(len(origins), -1)
+    to_full = ~full.transform @ band.grid.transform
+    centre = origins + size / 2.0
+    centre = np.stack(
+        [to_full.a * centre[:, 0] + to_full.c, to_full.e * centre[:, 1] + to_full.f], axis=1
+    )
+    return Patches(centre, values, valid, np.array([to_full.a, to_full.e]), size)
+
+
+def refine(
+    patches: Patches,
+    surface: Surface,
+    mapping: Callable[[FloatArray], FloatArray],
+    options: RefineOptions,
+) -> Refined:
+    """Match patches on a surface.
+
+    Parameters
+    ----------
+    patches : Patches
+    surface : Surface
+    mapping : callable
+        Template raster pixels (..., 2) to surface raster pixels (..., 2): the current transformation.
+    options : RefineOptions
+
+    Returns
+    -------
+    Refined
+        In the order of `patches`; none dropped.
+    """
+    count = len(patches)
+    local = linearise(mapping, patches.centre)
+    offsets = _offsets(patches.size)
+    move = np.zeros((count, 2))
+    last = np.full(count, np.inf)
+    covariance = np.full((count, 2, 2), np.inf)
+    correlation = np.zeros(count)
+    share = np.zeros(count)
+    active = np.arange(count)
+    for _ in range(options.iterations):
+        if not len(active):
+            break
+        step = _gauss_newton(patches, surface, local, offsets, move, active)
+        move[active] += step.move
+        covariance[active], correlation[active] = step.covariance, step.correlation
+        share[active] = step.usable_share
+        last[active] = np.abs(step.move).max(axis=1)
+        lost = np.abs(move[active]).max(axis=1) > 2 * options.max_move
+        active = active[(last[active] >= options.tolerance) & ~lost]
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(_finite(covariance))[:, 1], 0))
+    status = np.zeros(count, dtype=np.uint8)
+    status[np.abs(correlation) < options.min_correlation] = Status.CORRELATION
+    status[(last > 5 * options.tolerance) | (np.abs(move).max(axis=1) > options.max_move)] = (
+        Status.CONVERGENCE
+    )
+    status[~(spread < options.max_sigma) | (share < options.min_valid)] = Status.TEXTURE
+    linear = local[:, :, :2] * patches.step
+    position = local[:, :, 2] + np.einsum("pij,pj->pi", linear, move)
+    in_surface = np.einsum("pij,pjk,plk->pil", linear, _finite(covariance), linear)
+    return Refined(patches.centre, position, in_surface, correlation, status)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    move: FloatArray
+    covariance: FloatArray
+    correlation: FloatArray
+    usable_share: FloatArray
+
+
+def _gauss_newton(
+    patches: Patches,
+    surface: Surface,
+    local: FloatArray,
+    offsets: FloatArray,
+    move: FloatArray,
+    active: np.ndarray[tuple[int], np.dtype[np.intp]],
+) -> _Step:
+    """One step for the active patches: regress template on image, its two derivatives and 1."""
+    n, side = patches.size, patches.size + 2 * _MARGIN
+    linear = local[active, :, :2] * patches.step
+    anchor = local[active, :, 2] + np.einsum("pij,pj->pi", linear, move[active])
+    position = np.einsum("pij,kj->pki", linear, offsets) + anchor[:, None, :]
+    values, usable = sample(surface, position)
+    image = values.reshape(-1, side, side)
+    good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
+    good = good & patches.valid[active]
+    weight = good.astype(np.float32)
+    along_x = (image[:, 1:-1, 2:] - image[:, 1:-1, :-2]).reshape(len(active), n * n) / 2
+    along_y = (image[:, 2:, 1:-1] - image[:, :-2, 1:-1]).reshape(len(active), n * n) / 2
+    columns = [image[:, 1:-1, 1:-1].reshape(len(active), n * n), along_x, along_y]
+    columns.append(patches.values[active])
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1)
+    centred = [(c - (c * weight).sum(axis=1, keepdims=True) / total) * weight for c in columns]
+    stack = np.stack(centred, axis=1)
+    gram = np.matmul(stack, stack.transpose(0, 2, 1)).astype(np.float64)
+    return _solve(gram, total[:, 0].astype(np.float64), good.mean(axis=1))
+
+
+def _solve(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
+    """Displacement from the (P, 4, 4) Gram matrices of image, d/dx, d/dy and template."""
+    normal, right, energy = gram[:, :3, :3], gram[:, :3, 3], gram[:, 3, 3]
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-12))
+    scaled = normal / (scale[:, :, None] * scale[:, None, :])
+    solvable = (np.linalg.det(scaled) > 1e-6) & (total > 12) & (energy > 0)
+    scaled[~solvable] = np.eye(3)
+    inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    solution = np.einsum("pij,pj->pi", inverse, right)
+    solvable &= np.abs(solution[:, 0]) > 1e-9
+    gain = np.where(solvable, solution[:, 0], 1.0)
+    move = solution[:, 1:] / gain[:, None]
+    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
+    variance = residual / np.maximum(total - 4, 1)
+    covariance = inverse[:, 1:, 1:] * (variance / gain**2)[:, None, None]
+    together = np.sqrt(np.maximum(gram[:, 0, 0] * energy, 1e-12))
+    correlation = gram[:, 0, 3] / together
+    move[~solvable] = 0.0
+    covariance[~solvable] = np.inf
+    correlation[~solvable] = 0.0
+    return _Step(np.clip(move, -1.0, 1.0), covariance, correlation, share)
+
+
+def _finite(covariance: FloatArray) -> FloatArray:
+    good = np.isfinite(covariance).all(axis=(1, 2))
+    return np.where(good[:, None, None], covariance, np.eye(2) * 1e6)
+
+
+def _offsets(size: int) -> FloatArray:
+    """((n + 2)², 2) positions of patch pixels, with a margin, from the centre, in patch pixels."""
+    axis = np.arange(size + 2 * _MARGIN) - _MARGIN + HALF_PIXEL - size / 2.0
+    grid_x, grid_y = np.meshgrid(axis, axis)
+    return np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)

@@ -1,0 +1,1 @@
+"""The method: `register` is the whole of it on one page; it opens no file and prints nothing."""

@@ -1,0 +1,117 @@
+"""Where a registration stands between its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fit.models import Frame
+from geodelreg.geo.affine import affine_from_matrix, apply_affine
+from geodelreg.geo.crs import HeaderMapping, header_mapping, linearise
+from geodelreg.geo.grid import gsd_px_m
+from geodelreg.options import AlignOptions
+from geodelreg.types import FloatArray, WindowReader
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """The two rasters and how their headers relate them.
+
+    Attributes
+    ----------
+    source, reference : WindowReader
+        MS and PAN.
+    source_bands : tuple of int
+        MS bands to match on, from 1.
+    mapping : HeaderMapping
+        MS pixels to PAN pixels, as the headers claim.
+    source_gsd_m, reference_gsd_m : (float, float)
+        Ground size of a pixel along columns and rows.
+    options : AlignOptions
+    """
+
+    source: WindowReader
+    reference: WindowReader
+    source_bands: tuple[int, ...]
+    mapping: HeaderMapping
+    source_gsd_m: tuple[float, float]
+    reference_gsd_m: tuple[float, float]
+    options: AlignOptions
+
+    @property
+    def source_is_coarser(self) -> bool:
+        """True when an MS pixel is at least as large as a PAN pixel."""
+        return self.source_area_ratio >= 1.0 - 1e-6
+
+    @property
+    def source_area_ratio(self) -> float:
+        """Area of an MS pixel over that of a PAN pixel."""
+        mine, other = self.source_gsd_m, self.reference_gsd_m
+        return (mine[0] * mine[1]) / (other[0] * other[1])
+
+    @property
+    def pan_px_per_source_px(self) -> float:
+        """GSD ratio: PAN pixels to one MS pixel."""
+        return float(np.sqrt(self.source_area_ratio))
+
+    def frame(self) -> Frame:
+        """Coordinates for fitting: the MS raster's centre, half its longer side, metric axes."""
+        height, width = self.source.grid.shape
+        t = self.source.grid.transform
+        unit = np.array([[t.a, t.b], [t.d, t.e]])
+        unit = unit / np.hypot(unit[0], unit[1])
+        skew = unit * np.array(self.source_gsd_m)
+        return Frame((width / 2, height / 2), max(height, width) / 2, tuple(skew.ravel().tolist()))
+
+    def to_reference(self, matrix: FloatArray, source_px: FloatArray) -> FloatArray:
+        """(..., 2) MS pixels to PAN pixels through a correction `matrix` (2, 3) and the headers."""
+        return self.mapping.forward(apply_affine(affine_from_matrix(matrix), source_px))
+
+    def to_source(self, matrix: FloatArray, reference_px: FloatArray) -> FloatArray:
+        """(..., 2) PAN pixels to MS pixels, the inverse of `to_reference`."""
+        header_px = self.mapping.inverse(reference_px)
+        return apply_affine(~affine_from_matrix(matrix), header_px)
+
+    def header_px(
+        self, reference_px: FloatArray, covariance_px2: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """PAN positions with covariances, as MS header pixels.
+
+        Parameters
+        ----------
+        reference_px : (N, 2) float64
+        covariance_px2 : (N, 2, 2) float64
+            In PAN pixels squared.
+
+        Returns
+        -------
+        (N, 2) and (N, 2, 2) float64, in MS pixels.
+        """
+        local = linearise(self.mapping.inverse, reference_px)
+        jacobian = local[:, :, :2]
+        covariance = np.einsum("pij,pjk,plk->pil", jacobian, covariance_px2, jacobian)
+        return local[:, :, 2], covariance
+
+
+def make_pair(source: WindowReader, reference: WindowReader, options: AlignOptions) -> Pair:
+    """Relate two rasters by their headers.
+
+    Raises
+    ------
+    CrsTransformError
+        If PROJ knows no operation between the CRSs.
+    """
+    bands = (options.band,) if options.band else tuple(range(1, len(source.band_names) + 1))
+    return Pair(
+        source,
+        reference,
+        bands,
+        header_mapping(source.grid, reference.grid),
+        gsd_px_m(source.grid),
+        gsd_px_m(reference.grid),
+        options,
+    )
