@@ -237,9 +237,7 @@ def test_a_terminal_gets_a_bar_and_stdout_stays_json(pair: Path) -> None:
     leader, follower = pytest.importorskip("pty").openpty()
     process = subprocess.Popen(
         [
-            sys.executable,
-            "-m",
-            "geodelreg_cli",
+            *COMMAND,
             "align",
             "ms.tif",
             "pan.tif",
