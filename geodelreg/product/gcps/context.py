@@ -132,3 +132,31 @@ def exact(value: float) -> str:
 def one_line(wkt: str) -> str:
     """WKT without line breaks."""
     return "".join(part.strip() for part in wkt.splitlines())
+
+
+def crs_name(crs_wkt: str) -> str:
+    """``EPSG:code`` when that says exactly the same, else the WKT."""
+    from rasterio.crs import CRS
+
+    crs = CRS.from_wkt(crs_wkt)
+    code = crs.to_epsg()
+    if code is not None and CRS.from_epsg(code) == crs:
+        return f"EPSG:{code}"
+    return crs_wkt
+
+
+def crs_wkt_of(name: str) -> str:
+    """WKT2 of a CRS given as ``EPSG:code``, WKT, or a PROJ string.
+
+    Raises
+    ------
+    GcpFormatError
+        If it is unknown.
+    """
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        return str(CRS.from_string(name).to_wkt(version="WKT2_2019"))
+    except CRSError as error:
+        raise GcpFormatError(f"its CRS {name!r} is unknown") from error

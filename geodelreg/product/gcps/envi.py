@@ -152,9 +152,9 @@ def _envi_header(crs_wkt: str) -> str:
     from affine import Affine
 
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "one_pixel.img")
+        path = Path(folder, "tiny.img")
         profile = {"driver": "ENVI", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
-        grid = Affine(1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+        grid = Affine(2.0, 0.0, 0.0, 0.0, -2.0, 0.0)
         with rasterio.open(path, "w", crs=crs_wkt, transform=grid, **profile):
             pass
         return path.with_suffix(".hdr").read_text(encoding="utf-8")
@@ -170,14 +170,14 @@ def _crs_of_projection(info: str) -> str | None:
     numeric = fields[0].isdigit()
     name = fields[-1] if numeric else fields[0]
     rest = fields[-2:-1] if numeric else fields[1:]
-    lines = ["ENVI", "samples = 1", "lines = 1", "bands = 1", "header offset = 0", "data type = 1"]
-    lines += ["interleave = bsq", f"map info = {{{', '.join([name, *'110011', *rest, *units])}}}"]
+    lines = ["ENVI", "samples = 2", "lines = 1", "bands = 1", "header offset = 0", "data type = 1"]
+    lines += ["interleave = bsq", f"map info = {{{', '.join([name, *'110022', *rest, *units])}}}"]
     if numeric:
         lines.append(f"projection info = {{{', '.join(fields)}}}")
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        path = Path(folder, "one_pixel.img")
-        path.write_bytes(b"\0")
+        path = Path(folder, "tiny.img")
+        path.write_bytes(b"\0\0")
         path.with_suffix(".hdr").write_text("\n".join(lines) + "\n", encoding="utf-8")
         with rasterio.open(path) as dataset:
             crs = dataset.crs

@@ -9,7 +9,14 @@ from typing import Any
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.crs import map_points
-from geodelreg.product.gcps.context import Decoded, GcpContext, ground_of, numbers
+from geodelreg.product.gcps.context import (
+    Decoded,
+    GcpContext,
+    crs_name,
+    crs_wkt_of,
+    ground_of,
+    numbers,
+)
 from geodelreg.types import Gcp
 
 _RECORD_SEPARATOR = "\x1e"
@@ -21,7 +28,7 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
 
     crs_wkt = context.source.crs_wkt
     positions = map_points(ground_of(gcps), crs_wkt, CRS.from_epsg(4326).to_wkt())
-    name = _crs_name(crs_wkt)
+    name = crs_name(crs_wkt)
     features = [
         _feature(gcp, longitude, latitude, name)
         for gcp, (longitude, latitude) in zip(gcps, positions.tolist(), strict=True)
@@ -48,17 +55,6 @@ def _feature(gcp: Gcp, longitude: float, latitude: float, crs: str) -> dict[str,
     }
 
 
-def _crs_name(crs_wkt: str) -> str:
-    """``EPSG:code`` when that says exactly the same, else the WKT."""
-    from rasterio.crs import CRS
-
-    crs = CRS.from_wkt(crs_wkt)
-    code = crs.to_epsg()
-    if code is not None and CRS.from_epsg(code) == crs:
-        return f"EPSG:{code}"
-    return crs_wkt
-
-
 def decode(text: str, context: GcpContext | None) -> Decoded:
     """GCPs of a feature collection, a feature, or a sequence of features, one a line.
 
@@ -72,7 +68,7 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     if len(names) > 1:
         raise GcpFormatError("the features have different CRSs")
     gcps = tuple(_gcp(item, index) for index, item in enumerate(properties, start=1))
-    return gcps, _crs_wkt(names.pop()) if names else None
+    return gcps, crs_wkt_of(names.pop()) if names else None
 
 
 def _features(text: str) -> list[Any]:
@@ -105,13 +101,3 @@ def _gcp(item: dict[str, Any], index: int) -> Gcp:
     column, row, x, y = numbers(texts, index)
     z = numbers([str(item.get("z") or 0.0)], index)[0]
     return Gcp(str(item.get("id", index)), column, row, x, y, z, str(item.get("info") or ""))
-
-
-def _crs_wkt(name: str) -> str:
-    from rasterio.crs import CRS
-    from rasterio.errors import CRSError
-
-    try:
-        return str(CRS.from_string(name).to_wkt(version="WKT2_2019"))
-    except CRSError as error:
-        raise GcpFormatError(f"its CRS {name!r} is unknown") from error

@@ -1,26 +1,34 @@
-"""Option file of ``gdal_translate --optfile``: one ``-gcp`` per line.
+"""Option file of ``gdal_translate --optfile``: ``-a_srs``, then one ``-gcp`` per line.
 
-Lines that begin with ``#`` are comments to GDAL; the CRS stands in one, for readers of this file.
-The elevation is always written, so that a file name made of digits cannot be taken for it.
+Without ``-a_srs`` GDAL gives the GCPs no CRS.  The elevation is always written, so that a file name
+made of digits cannot be taken for it.  Lines that begin with ``#`` are comments.
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 from geodelreg.errors import GcpFormatError
-from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers, one_line
+from geodelreg.product.gcps.context import (
+    Decoded,
+    GcpContext,
+    crs_name,
+    crs_wkt_of,
+    exact,
+    numbers,
+    one_line,
+)
 from geodelreg.types import Gcp
-
-_CRS_PREFIX = "# CRS: "
 
 
 def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
     """Text of an option file."""
+    crs = one_line(crs_name(context.source.crs_wkt)).replace("\\", "\\\\").replace('"', '\\"')
     lines = [
         "# gdal_translate --optfile THIS IN OUT; pixel line easting northing elevation",
-        _CRS_PREFIX + one_line(context.source.crs_wkt),
+        f'-a_srs "{crs}"',
     ]
     for gcp in gcps:
         values = (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z)
@@ -29,22 +37,29 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
 
 
 def decode(text: str, context: GcpContext | None) -> Decoded:
-    """GCPs of an option file; other options in it are passed over.
+    """GCPs of an option file; options other than ``-gcp`` and ``-a_srs`` are passed over.
 
     Raises
     ------
     GcpFormatError
         If a ``-gcp`` is not followed by at least 4 numbers.
     """
-    crs_wkt = None
     words: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), start=1):
-        if line.startswith(_CRS_PREFIX):
-            crs_wkt = line[len(_CRS_PREFIX) :].strip()
-        elif not line.startswith("#"):
-            words += [(number, word) for word in line.split()]
-    starts = [index for index, (_, word) in enumerate(words) if word == "-gcp"]
-    return tuple(_gcp(words, start, str(count)) for count, start in enumerate(starts, 1)), crs_wkt
+        if not line.startswith("#"):
+            words += [(number, word) for word in _words(line, number)]
+    options = [word for _, word in words]
+    crs = options[options.index("-a_srs") + 1 :] if "-a_srs" in options else []
+    starts = [index for index, word in enumerate(options) if word == "-gcp"]
+    gcps = tuple(_gcp(words, start, str(count)) for count, start in enumerate(starts, start=1))
+    return gcps, crs_wkt_of(crs[0]) if crs else None
+
+
+def _words(line: str, number: int) -> list[str]:
+    try:
+        return shlex.split(line)
+    except ValueError as error:
+        raise GcpFormatError(f"line {number}: {error}") from error
 
 
 def _gcp(words: list[tuple[int, str]], start: int, name: str) -> Gcp:

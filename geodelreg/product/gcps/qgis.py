@@ -19,6 +19,7 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.product.gcps.context import (
     Decoded,
     GcpContext,
+    crs_wkt_of,
     exact,
     ground_of,
     numbers,
@@ -39,8 +40,8 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
         gcps, claimed.tolist(), _residuals(gcps, context).tolist(), strict=True
     ):
         values = (gcp.x, gcp.y, x, y)
-        residual = f"{dx:.6f},{dy:.6f},{math.hypot(dx, dy):.6f}"
-        lines.append(",".join(map(exact, values)) + ",1," + residual)
+        residual = (round(value, 6) + 0.0 for value in (dx, dy, math.hypot(dx, dy)))
+        lines.append(",".join([*map(exact, values), "1", *map(exact, residual)]))
     return "\n".join(lines) + "\n"
 
 
@@ -69,7 +70,7 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     lines = text.splitlines()
     crs_wkt = None
     if lines and lines[0].startswith(_CRS_PREFIX.strip()):
-        crs_wkt = lines.pop(0)[len(_CRS_PREFIX.strip()) :].strip()
+        crs_wkt = crs_wkt_of(lines.pop(0)[len(_CRS_PREFIX.strip()) :].strip())
     first = len(text.splitlines()) - len(lines) + 2
     rows = [
         _enabled_row(line, number)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 from geodelreg.errors import GcpFormatError, RasterUnreadableError
-from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers, one_line
+from geodelreg.product.gcps.context import Decoded, GcpContext, crs_wkt_of, exact, numbers, one_line
 from geodelreg.types import Gcp
 
 if TYPE_CHECKING:
@@ -181,7 +181,8 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     if element is None:
         raise GcpFormatError("it has no GCPList")
     gcps = tuple(_gcp(item, index) for index, item in enumerate(element.findall("GCP"), start=1))
-    return gcps, element.get("Projection") or None
+    crs = element.get("Projection")
+    return gcps, crs_wkt_of(crs) if crs else None
 
 
 def _gcp(item: ET.Element, index: int) -> Gcp:
