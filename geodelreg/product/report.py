@@ -183,7 +183,7 @@ def _found_line(alignment: Alignment) -> str:
     if alignment.correction.model == "affine":
         parts.append(f"shear {motion.shear_deg:+.4f}°")
     return (
-        f"Aligned: MS was {off} off PAN. At its centre it moves {', '.join(parts)} "
+        f"Aligned: MS lay {off} off PAN; at its centre it moves {', '.join(parts)} "
         f"(model {alignment.correction.model})."
     )
 
