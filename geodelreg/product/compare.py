@@ -1,0 +1,253 @@
+"""An output against its source: pixels must be the same, what else differs is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.errors import LossyOutputError, OutputUnwritableError, RasterUnreadableError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.product.geotags import DOMAIN
+from geodelreg.product.header import Provenance
+
+_WINDOW_BYTES = 32_000_000
+_ATTRIBUTES = {
+    "nodatavals": "no-data values",
+    "descriptions": "band descriptions",
+    "colorinterp": "colour interpretation",
+    "scales": "scales",
+    "offsets": "offsets",
+    "units": "units",
+}
+_ENCODING = {
+    "block_shapes": "block size",
+    "interleaving": "interleave",
+    "compression": "compression",
+    "photometric": "photometric interpretation",
+}
+GDAL_DOMAINS = {"DERIVED_SUBDATASETS", "SUBDATASETS", "IMAGE_STRUCTURE", "LocationInfo", "RPC"}
+"""Metadata domains that GDAL fills itself."""
+
+
+def check_placement(out: Path, target: Path, content: Provenance, tolerance_px: float) -> None:
+    """Read back through GDAL where the output lies.
+
+    Parameters
+    ----------
+    out, target : Path
+        The file as it is now, and its final name for messages.
+    content : Provenance
+    tolerance_px : float
+        Largest displacement of a corner.
+
+    Raises
+    ------
+    OutputUnwritableError
+        Its format does not hold the georeferencing.
+    """
+    import rasterio
+
+    with rasterio.open(out) as dataset:
+        if content.georef == "gcps":
+            good = len(dataset.gcps[0]) == len(content.gcps)
+        else:
+            width, height = dataset.width, dataset.height
+            corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=float)
+            there = apply_affine(dataset.transform, corners)
+            back = apply_affine(~content.correction.corrected, there)
+            good = bool(np.abs(back - corners).max() <= tolerance_px)
+        driver = dataset.driver
+    if not good:
+        raise OutputUnwritableError(
+            f"{target} cannot be written: {driver} does not keep this georeferencing",
+            "Choose another format, e.g. --of GTiff.",
+        )
+
+
+def metadata_differences(
+    source: Path, out: Path, same_encoding: bool, strip_rpc: bool
+) -> list[str]:
+    """What the output says differently, one text each; georeferencing apart.
+
+    Parameters
+    ----------
+    source, out : Path
+    same_encoding : bool
+        Compare block size, interleave and compression too.
+    strip_rpc : bool
+        RPCs are meant to be missing.
+    """
+    import rasterio
+
+    names = _ATTRIBUTES | (_ENCODING if same_encoding else {})
+    with rasterio.open(source) as before, rasterio.open(out) as after:
+        found = [
+            text
+            for name, text in names.items()
+            if not _same(getattr(before, name), getattr(after, name))
+        ]
+        bands = before.indexes
+        if any(before.overviews(b) != after.overviews(b) for b in bands):
+            found.append("overviews")
+        if before.mask_flag_enums != after.mask_flag_enums:
+            found.append("kind of mask")
+        if any(_colormap(before, b) != _colormap(after, b) for b in bands):
+            found.append("colour table")
+    lost = lost_metadata(source, out, {"RPC"} if strip_rpc else set())
+    for band, domains in enumerate(lost):
+        where = f" of band {band}" if band else ""
+        for domain, items in domains.items():
+            found.append(f"metadata {domain}{where} ({', '.join(sorted(items)[:5])})")
+    return found
+
+
+def lost_metadata(
+    source: Path, out: Path, ignored: Collection[str] = ()
+) -> list[dict[str, dict[str, str]]]:
+    """Metadata items of the source that the output lacks or says differently.
+
+    Parameters
+    ----------
+    source, out : Path
+    ignored : collection of str
+        Domains that do not count.
+
+    Returns
+    -------
+    list of dict
+        Items by domain ("" the default one): of the raster first, then of each band.
+    """
+    import rasterio
+
+    with rasterio.open(source) as before, rasterio.open(out) as after:
+        levels = (0, *(band for band in before.indexes if band <= after.count))
+        return [_lost_items(before, after, level, ignored) for level in levels]
+
+
+def check_pixels(source: Path, out: Path, target: Path, overviews: bool) -> None:
+    """Compare decoded values and masks, window by window, and overviews where they are stored.
+
+    Raises
+    ------
+    LossyOutputError
+        Something differs, or the output cannot be read back.
+    RasterUnreadableError
+        The source cannot be decoded.
+    """
+    import rasterio
+
+    with rasterio.open(source) as before, rasterio.open(out) as after:
+        if (before.dtypes, before.shape) != (after.dtypes, after.shape):
+            raise _lossy(target, f"bands of {after.dtypes[0]} instead of {before.dtypes[0]}")
+        _check_values(before, after, target)
+        levels = before.overviews(1) if overviews else []
+        if levels != after.overviews(1):
+            levels = []
+    for level in range(len(levels)):
+        with (
+            rasterio.open(source, OVERVIEW_LEVEL=level) as before,
+            rasterio.open(out, OVERVIEW_LEVEL=level) as after,
+        ):
+            _check_values(before, after, target)
+
+
+def check_decodable(source: Path) -> None:
+    """Read a whole raster.
+
+    Raises
+    ------
+    RasterUnreadableError
+    """
+    import rasterio
+
+    with rasterio.open(source) as dataset:
+        for window in windows_of(dataset):
+            _read(dataset, window, RasterUnreadableError, source)
+
+
+def windows_of(dataset: Any) -> Iterator[Any]:
+    """Windows of whole blocks that cover a dataset, of a bounded size over all bands."""
+    from rasterio.windows import Window
+
+    block_height, block_width = dataset.block_shapes[0]
+    pixel_bytes = sum(np.dtype(_numpy_type(name)).itemsize for name in dataset.dtypes)
+    pixels = max(1, _WINDOW_BYTES // pixel_bytes)
+    width = min(
+        dataset.width, max(block_width, pixels // block_height // block_width * block_width)
+    )
+    height = max(block_height, pixels // width // block_height * block_height)
+    for row in range(0, dataset.height, height):
+        for column in range(0, dataset.width, width):
+            yield Window(
+                column, row, min(width, dataset.width - column), min(height, dataset.height - row)
+            )
+
+
+def _check_values(before: Any, after: Any, target: Path) -> None:
+    for window in windows_of(before):
+        expected = _read(before, window, RasterUnreadableError, Path(before.name))
+        found = _read(after, window, LossyOutputError, target)
+        if not all(_same_bytes(a, b) for a, b in zip(expected, found, strict=True)):
+            raise _lossy(target, "decoded pixels or masks differ")
+
+
+def _read(dataset: Any, window: Any, error_class: type, path: Path) -> tuple[Any, Any]:
+    from rasterio.errors import RasterioIOError
+
+    try:
+        return dataset.read(window=window), dataset.read_masks(window=window)
+    except RasterioIOError as error:
+        raise error_class(
+            f"{path} cannot be decoded: {error}", "Obtain the file again, or choose another format."
+        ) from error
+
+
+def _lossy(target: Path, what: str) -> LossyOutputError:
+    return LossyOutputError(
+        f"{target} would not keep the pixels: {what}",
+        "Choose a lossless compression or format, e.g. --of GTiff --co COMPRESS=DEFLATE.",
+    )
+
+
+def _same_bytes(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return False
+    return bool(np.array_equal(a.view(np.uint8), b.view(np.uint8)))
+
+
+def _same(a: Any, b: Any) -> bool:
+    if not isinstance(a, tuple | list):
+        return bool(a == b or (a != a and b != b))
+    return len(a) == len(b) and all(_same(p, q) for p, q in zip(a, b, strict=True))
+
+
+def _numpy_type(name: str) -> str:
+    return {"complex_int16": "complex64"}.get(name, name)
+
+
+def _colormap(dataset: Any, band: int) -> Any:
+    try:
+        return dataset.colormap(band)
+    except ValueError:
+        return None
+
+
+def _lost_items(
+    before: Any, after: Any, band: int, ignored: Collection[str]
+) -> dict[str, dict[str, str]]:
+    ignored = {*GDAL_DOMAINS, DOMAIN} - {"RPC"} | set(ignored)
+    lost = {}
+    for domain in sorted({"", *before.tag_namespaces(band)} - ignored):
+        new = after.tags(band, ns=domain or None)
+        items = {
+            key: value
+            for key, value in before.tags(band, ns=domain or None).items()
+            if not key.startswith(DOMAIN + "_") and new.get(key, "").strip() != value.strip()
+        }
+        if items:
+            lost[domain] = items
+    return lost

@@ -1,0 +1,34 @@
+"""GDAL's settings while product reads and writes rasters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+CACHE_BYTES = 64_000_000
+"""GDAL's own default is 5 % of the RAM; writing block by block needs no more than this."""
+
+
+@contextmanager
+def gdal_session() -> Iterator[None]:
+    """Bound GDAL's block cache, use all cores, keep masks inside TIFFs and write no statistics."""
+    import rasterio
+    from rasterio.env import get_gdal_config
+
+    with rasterio.Env():
+        cache = min(int(get_gdal_config("GDAL_CACHEMAX")), CACHE_BYTES)
+    with rasterio.Env(
+        GDAL_CACHEMAX=cache,
+        GDAL_NUM_THREADS="ALL_CPUS",
+        GDAL_TIFF_INTERNAL_MASK=True,
+        GTIFF_IMPLICIT_JPEG_OVR=False,
+    ):
+        yield
+
+
+def gdal_failures() -> tuple[type[Exception], ...]:
+    """Exceptions that rasterio raises for GDAL's errors."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    return (RasterioError, CPLE_BaseError)

@@ -1,0 +1,200 @@
+"""Rasters written anew through GDAL: other formats, other creation options.
+
+Nothing is believed: the decoded pixels are compared with the source before the output appears.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.options import WriteOptions
+from geodelreg.product import compare, sidecars
+from geodelreg.product.environment import gdal_failures
+from geodelreg.product.header import Provenance, merged_domains
+from geodelreg.product.tiff import is_tiff
+from geodelreg.product.tiffwrite import edit_private
+from geodelreg.product.view import corrected_view
+
+logger = logging.getLogger(__name__)
+
+_TIFF_DRIVERS = ("GTiff", "COG")
+_LOSSLESS = ("DEFLATE", "LZW", "ZSTD", "LZMA", "PACKBITS")
+_LOSSLESS_DEFAULTS = {
+    "JP2OpenJPEG": {"QUALITY": "100", "REVERSIBLE": "YES"},
+    "WEBP": {"LOSSLESS": "YES"},
+}
+_NOT_CARRIED = {"RPC"}
+
+
+def output_driver(target: Path, driver: str | None) -> str:
+    """GDAL driver of an output: as asked for, or by its extension, GTiff without one.
+
+    Raises
+    ------
+    UsageError
+        It is unknown.
+    """
+    import rasterio
+    from rasterio.drivers import raster_driver_extensions
+
+    if driver is None:
+        extension = target.suffix.lstrip(".").lower()
+        by_extension: dict[str, str] = {"": "GTiff", **raster_driver_extensions()}
+        if extension not in by_extension:
+            raise UsageError(
+                f"{target}: no format is known for the extension .{extension}",
+                "Name the format, e.g. --of GTiff.",
+            )
+        return by_extension[extension]
+    with rasterio.Env() as env:
+        known: dict[str, str] = {name.upper(): name for name in env.drivers()}
+    if driver.upper() not in known:
+        raise UsageError(f"GDAL has no format {driver!r} here", "See gdalinfo --formats.")
+    return known[driver.upper()]
+
+
+def rewrite(
+    source: Path, out: Path, target: Path, content: Provenance, options: WriteOptions
+) -> list[str]:
+    """Write `source` to `out` in another format or with other creation options.
+
+    Parameters
+    ----------
+    source, out : Path
+    target : Path
+        Final name, for messages.
+    content : Provenance
+    options : WriteOptions
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    LossyOutputError
+        Decoded pixels or masks would differ.
+    OutputUnwritableError, RasterUnreadableError, UsageError
+    """
+    driver = output_driver(target, options.driver)
+    notes: list[str] = []
+    if driver in _TIFF_DRIVERS:
+        creation = _tiff_creation(source, driver, options, notes)
+        _create_copy(source, str(source), out, target, driver, creation)
+        edit_private(out, content, compare.lost_metadata(source, out, _NOT_CARRIED))
+        _clean_pam(out, content)
+    else:
+        with corrected_view(source, content) as (name, xml):
+            if driver == "VRT":
+                out.write_text(xml, encoding="utf-8")
+            else:
+                creation = _LOSSLESS_DEFAULTS.get(driver, {}) | _user_creation(options)
+                _create_copy(source, name, out, target, driver, creation)
+        _complete_metadata(source, out, content)
+    compare.check_pixels(source, out, target, overviews=driver in _TIFF_DRIVERS)
+    return notes
+
+
+def _create_copy(
+    source: Path, name: str, out: Path, target: Path, driver: str, creation: Mapping[str, str]
+) -> None:
+    import rasterio.shutil
+
+    logger.debug("%s: %s %s", target, driver, dict(creation))
+    try:
+        rasterio.shutil.copy(name, out, driver=driver, strict=False, **creation)
+    except gdal_failures() as error:
+        compare.check_decodable(source)
+        raise OutputUnwritableError(
+            f"{target} cannot be written as {driver}: {error}",
+            "Check the disk and the creation options, or choose another format.",
+        ) from error
+
+
+def _user_creation(options: WriteOptions) -> dict[str, str]:
+    pairs = (option.split("=", 1) for option in options.creation_options)
+    return {key.strip().upper(): value.strip() for key, value in pairs}
+
+
+def _tiff_creation(
+    source: Path, driver: str, options: WriteOptions, notes: list[str]
+) -> dict[str, str]:
+    """Creation options: the user's, and for the rest the source's own encoding if it is a TIFF."""
+    import rasterio
+
+    user = _user_creation(options)
+    creation = {"BIGTIFF": "IF_SAFER"}
+    with rasterio.open(source) as dataset:
+        structure = dataset.tags(ns="IMAGE_STRUCTURE")
+        has_overviews = bool(dataset.overviews(1))
+        inherited = dataset.driver in _TIFF_DRIVERS and is_tiff(source)
+        blocks = dataset.block_shapes[0]
+        tiled = dataset.is_tiled
+    if inherited:
+        creation |= _inherited_compression(structure, driver, user, notes)
+        if driver == "GTiff":
+            creation["INTERLEAVE"] = structure.get("INTERLEAVE", "PIXEL")
+            creation["TILED"] = "YES" if tiled else "NO"
+            creation["BLOCKYSIZE"] = str(blocks[0])
+            if tiled:
+                creation["BLOCKXSIZE"] = str(blocks[1])
+        elif tiled and blocks[0] == blocks[1]:
+            creation["BLOCKSIZE"] = str(blocks[0])
+    if has_overviews and driver == "GTiff":
+        creation["COPY_SRC_OVERVIEWS"] = "YES"
+    if user.get("TILED", creation.get("TILED", "")).upper() != creation.get("TILED"):
+        creation.pop("BLOCKXSIZE", None)
+        creation.pop("BLOCKYSIZE", None)
+    return creation | user
+
+
+def _inherited_compression(
+    structure: Mapping[str, str], driver: str, user: Mapping[str, str], notes: list[str]
+) -> dict[str, str]:
+    if "COMPRESS" in user:
+        return {}
+    compression = structure.get("COMPRESSION", "NONE")
+    if compression == "NONE":
+        return {"COMPRESS": "NONE"}
+    if compression not in _LOSSLESS:
+        notes.append(
+            f"{compression} would be lossy when written anew; the output is compressed with DEFLATE"
+        )
+        return {"COMPRESS": "DEFLATE"}
+    creation = {"COMPRESS": compression}
+    predictor = structure.get("PREDICTOR", "1")
+    if predictor != "1":
+        names = {"2": "STANDARD", "3": "FLOATING_POINT"}
+        creation["PREDICTOR"] = predictor if driver == "GTiff" else names[predictor]
+    return creation
+
+
+def _clean_pam(out: Path, content: Provenance) -> None:
+    """Take georeferencing out of a PAM file that GDAL has written beside the output."""
+    pam = sidecars.pam_path(out)
+    if pam.is_file():
+        rest = sidecars.without_placement(pam.read_bytes(), content.strip_rpc)
+        pam.unlink()
+        if rest is not None:
+            pam.write_bytes(rest)
+
+
+def _complete_metadata(source: Path, out: Path, content: Provenance) -> None:
+    """Put what the format has no place for into a PAM file."""
+    import rasterio
+
+    with rasterio.open(out) as dataset:
+        unsaid = {
+            domain: items
+            for domain, items in content.domains.items()
+            if not items.items() <= dataset.tags(ns=domain or None).items()
+        }
+    missing = merged_domains(compare.lost_metadata(source, out, _NOT_CARRIED)[0], unsaid)
+    if missing:
+        path = sidecars.pam_path(out)
+        pam = path.read_bytes() if path.is_file() else None
+        path.write_bytes(sidecars.with_metadata(pam, missing))

@@ -1,0 +1,95 @@
+"""The source as GDAL would read it with a corrected header: a virtual raster in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from affine import Affine
+
+from geodelreg.product import compare, sidecars
+from geodelreg.product.header import Provenance
+
+
+@contextmanager
+def corrected_view(
+    source: Path, content: Provenance, mask_only: bool = False
+) -> Iterator[tuple[str, str]]:
+    """Yield name and XML of a VRT of `source` with corrected georeferencing and provenance.
+
+    Parameters
+    ----------
+    source : Path
+    content : Provenance
+    mask_only : bool
+        Leave out no-data values where the raster has a mask as well, which then rules.
+    """
+    import rasterio
+    import rasterio.shutil
+    from rasterio.io import MemoryFile
+
+    with MemoryFile(ext=".vrt") as plain, rasterio.open(source) as dataset:
+        rasterio.shutil.copy(dataset, plain.name, driver="VRT")
+        root = ElementTree.fromstring(plain.read())
+        for element, band in (
+            (root, 0),
+            *zip(root.iter("VRTRasterBand"), dataset.indexes, strict=False),
+        ):
+            sidecars.add_metadata(element, _further_domains(dataset, band))
+    _replace_placement(root, content)
+    _replace_metadata(root, content)
+    if mask_only and root.find("MaskBand") is not None:
+        for band in root.findall("VRTRasterBand"):
+            for element in band.findall("NoDataValue"):
+                band.remove(element)
+    text: str = ElementTree.tostring(root, encoding="unicode")
+    with MemoryFile(text.encode(), ext=".vrt") as corrected:
+        yield corrected.name, text
+
+
+def _further_domains(dataset: Any, band: int) -> dict[str, dict[str, str]]:
+    """Metadata of the domains that GDAL does not carry over; those of GDAL itself apart."""
+    own = set(dataset.tag_namespaces(band)) - compare.GDAL_DOMAINS
+    return {
+        domain: dataset.tags(band, ns=domain) for domain in own if not domain.startswith("xml:")
+    }
+
+
+def _replace_placement(root: ElementTree.Element, content: Provenance) -> None:
+    for tag in ("GeoTransform", "GCPList"):
+        for element in root.findall(tag):
+            root.remove(element)
+    if content.georef == "gcps":
+        srs = root.find("SRS")
+        if srs is not None:
+            root.remove(srs)
+        root.insert(0, _gcp_list(content, srs))
+    else:
+        transform = ElementTree.Element("GeoTransform")
+        transform.text = _gdal_order(content.correction.corrected)
+        root.insert(0, transform)
+
+
+def _gdal_order(transform: Affine) -> str:
+    return ", ".join(repr(float(value)) for value in transform.to_gdal())
+
+
+def _gcp_list(content: Provenance, srs: ElementTree.Element | None) -> ElementTree.Element:
+    attributes = {} if srs is None else {"Projection": srs.text or "", **srs.attrib}
+    gcps = ElementTree.Element("GCPList", attributes)
+    for gcp in content.gcps:
+        position = (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z)
+        values = zip(("Pixel", "Line", "X", "Y", "Z"), map(repr, map(float, position)), strict=True)
+        ElementTree.SubElement(gcps, "GCP", {"Id": gcp.id, "Info": gcp.info, **dict(values)})
+    return gcps
+
+
+def _replace_metadata(root: ElementTree.Element, content: Provenance) -> None:
+    if content.strip_rpc:
+        for element in root.findall("Metadata[@domain='RPC']"):
+            root.remove(element)
+    sidecars.drop_provenance(root)
+    sidecars.add_metadata(root, content.domains)
