@@ -140,3 +140,27 @@ def _paired_t(difference: FloatArray, blocks: IntArray) -> float:
         return float("inf") if difference[good].mean() > 0 else 0.0
     spread = means.std(ddof=1) / np.sqrt(len(means))
     return float(means.mean() / max(spread, 1e-12))
+
+
+def half_disagreement(points: Observations, estimate: Estimate, corners: FloatArray) -> float:
+    """Largest distance at the corners between fits to two disjoint halves, in source pixels.
+
+    The halves interleave like a chessboard, so that both cover the scene; half the distance
+    between their fits is about the error of the full fit.
+
+    Returns
+    -------
+    float
+        ``inf`` when a half cannot determine the model.
+    """
+    model = estimate.transformation.model
+    block = spatial_blocks(points.source)
+    white = (block % _BLOCKS + block // _BLOCKS) % 2 == 0
+    if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
+        return float("inf")
+    weight = np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
+    ends = []
+    for half in (white, ~white):
+        parameters, _ = weighted_fit(model, points.take(half), weight[half], estimate.frame)
+        ends.append(transformation(model, parameters, estimate.frame)(corners))
+    return float(np.hypot(*(ends[0] - ends[1]).T).max() / 2)

@@ -120,7 +120,7 @@ def _lattice(
     return np.stack([x, y], axis=1), (rows, columns)
 
 
-def _images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[Band, Surface]:
+def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[Band, Surface]:
     """The one template band and the one surface of a tile."""
     if part.ms_is_template():
         template, finer = tuning.tone(tile.template), tile.surface[0]
@@ -137,7 +137,7 @@ def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning
     for sigma in _SIGMA_CANDIDATES:
         total = 0.0
         for tile in chosen:
-            template, surface = _images(part, tile, replace(tuning, sigma=sigma))
+            template, surface = tile_images(part, tile, replace(tuning, sigma=sigma))
             xy, take = _lattice(template, part, 4000)
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
             good = usable[:, 0] & template.valid[take]
@@ -169,7 +169,7 @@ def match_pass(
     """Match every patch of every tile once and fit an affine to those that agree."""
 
     def one(tile: Tile) -> Refined | None:
-        template, surface = _images(part, tile, tuning)
+        template, surface = tile_images(part, tile, tuning)
         patches = cut_patches(template, part.template.grid, options.size)
         if not len(patches):
             return None

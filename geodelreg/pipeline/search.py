@@ -216,16 +216,16 @@ def _views(bands: list[Band]) -> Iterator[Band]:
     """The mean of the first (visible) bands, then single bands, spread over the spectrum."""
     if len(bands) > 1:
         first = bands[: min(_VISIBLE_BANDS, len(bands))]
-        yield _mean(first)
+        yield mean_band(first)
         if len(bands) > _VISIBLE_BANDS:
             yield bands[_VISIBLE_BANDS]
-            yield _mean(bands[_VISIBLE_BANDS:])
+            yield mean_band(bands[_VISIBLE_BANDS:])
             yield bands[2]
     else:
         yield bands[0]
 
 
-def _mean(bands: list[Band]) -> Band:
+def mean_band(bands: list[Band]) -> Band:
     """Mean of standardised bands."""
     data = np.zeros(bands[0].data.shape, dtype=np.float32)
     valid = np.ones(data.shape, dtype=bool)

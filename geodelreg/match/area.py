@@ -1,0 +1,151 @@
+"""Correlation of whole areas: where one image lies on the other, and whether it might lie elsewhere.
+
+Masked normalised cross-correlation through the Fourier transform (Padfield 2012,
+doi:10.1109/TIP.2011.2181402).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from geodelreg.types import BoolArray, Float32Array, FloatArray
+
+_PIXELS = 90_000
+_NEAR_PX = 8
+_RIVAL_OVERLAP = 0.35
+_SEARCH_OVERLAP = 0.15
+_HIGH_PASS_SIGMA_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """Template image and the low-passed surface image resampled on it, coarse.
+
+    Attributes
+    ----------
+    template, surface : (H, W) float32
+    valid : (H, W) bool
+    """
+
+    template: Float32Array
+    surface: Float32Array
+    valid: BoolArray
+
+
+def rival_correlation(overlay: Overlay) -> float:
+    """Best correlation at another displacement over that in place; 0 to about 1.
+
+    Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
+    that the images alone cannot tell.
+
+    Returns
+    -------
+    float
+        NaN when the overlay is too small or has no texture.
+    """
+    scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
+    one, mask = _detail(overlay.template, overlay.valid, scale)
+    other, _ = _detail(overlay.surface, overlay.valid, scale)
+    height, width = one.shape
+    if min(height, width) < 4 * _NEAR_PX or mask.sum() < 1000:
+        return float("nan")
+    scores = _masked_correlation(one, mask, other, mask, _RIVAL_OVERLAP)
+    middle_y, middle_x = height - 1, width - 1
+    reach = 1
+    here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
+    in_place = float(here.max())
+    if in_place <= 0:
+        return float("inf")
+    near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
+    scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
+    return float(scores.max()) / in_place
+
+
+def best_shift(overlay: Overlay, template_valid: BoolArray, surface_valid: BoolArray) -> FloatArray:
+    """Displacement at which the edges of the two images correlate best.
+
+    Parameters
+    ----------
+    overlay : Overlay
+    template_valid, surface_valid : (H, W) bool
+        Of each image by itself.
+
+    Returns
+    -------
+    (2,) float64
+        (columns, rows): content of `overlay.template` at x is that of `overlay.surface` at x plus
+        this, to about a pixel of the overlay.
+    """
+    scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
+    one, one_mask = _edges(*_detail(overlay.template, template_valid, scale))
+    other, other_mask = _edges(*_detail(overlay.surface, surface_valid, scale))
+    scores = _masked_correlation(one, one_mask, other, other_mask, _SEARCH_OVERLAP)
+    row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    height, width = one.shape
+    moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
+    return moved * np.array([overlay.template.shape[1] / width, overlay.template.shape[0] / height])
+
+
+def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Gradient magnitude less its mean: blind to the sign of the contrast."""
+    inner = cv2.erode(mask, np.ones((3, 3), np.uint8))
+    strength = cv2.magnitude(
+        cv2.Sobel(detail, cv2.CV_32F, 1, 0), cv2.Sobel(detail, cv2.CV_32F, 0, 1)
+    )
+    mean = float((strength * inner).sum() / max(float(inner.sum()), 1.0))
+    return np.asarray((strength - mean) * inner, np.float32), np.asarray(inner, np.float32)
+
+
+def _detail(
+    image: Float32Array, valid: BoolArray, scale: float
+) -> tuple[Float32Array, Float32Array]:
+    """High-passed, standardised image, scaled down, with its mask."""
+    weight = valid.astype(np.float32)
+    level = float(image[valid].mean()) if valid.any() else 0.0
+    centred = (image - np.float32(level)) * weight
+    if scale < 1.0:
+        shape = (max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1))
+        centred = cv2.resize(centred, shape, interpolation=cv2.INTER_AREA)
+        weight = cv2.resize(weight, shape, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(centred, (0, 0), _HIGH_PASS_SIGMA_PX)
+    share = cv2.GaussianBlur(weight, (0, 0), _HIGH_PASS_SIGMA_PX)
+    mask = (weight > 0.99).astype(np.float32)
+    detail = (centred - smooth / np.maximum(share, 1e-3)) * mask
+    spread = float(np.sqrt((detail**2).sum() / max(float(mask.sum()), 1.0)))
+    detail = np.clip(detail / max(spread, 1e-12), -3, 3)
+    return np.asarray(detail, dtype=np.float32), np.asarray(mask, dtype=np.float32)
+
+
+def _masked_correlation(
+    one: Float32Array,
+    one_mask: Float32Array,
+    other: Float32Array,
+    other_mask: Float32Array,
+    least_overlap: float,
+) -> Float32Array:
+    """(2 H − 1, 2 W − 1) normalised |correlation| for every displacement with enough overlap."""
+    height, width = one.shape
+    shape = (cv2.getOptimalDFTSize(2 * height - 1), cv2.getOptimalDFTSize(2 * width - 1))
+
+    def spectrum(image: Float32Array) -> Float32Array:
+        padded = np.zeros(shape, dtype=np.float32)
+        padded[:height, :width] = image
+        return np.asarray(cv2.dft(padded))
+
+    def correlate(a: Float32Array, b: Float32Array) -> Float32Array:
+        product = cv2.mulSpectrums(a, b, 0, conjB=True)
+        full = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
+        rolled = np.roll(full, (height - 1, width - 1), axis=(0, 1))
+        return np.asarray(rolled[: 2 * height - 1, : 2 * width - 1])
+
+    mask_a, mask_b = spectrum(one_mask), spectrum(other_mask)
+    overlap = correlate(mask_a, mask_b)
+    together = correlate(spectrum(one), spectrum(other))
+    power_one = correlate(spectrum(one * one), mask_b)
+    power_other = correlate(mask_a, spectrum(other * other))
+    enough = overlap > least_overlap * float(min(one_mask.sum(), other_mask.sum()))
+    power = np.sqrt(np.maximum(power_one * power_other, 1e-6))
+    return np.asarray(np.where(enough, np.abs(together) / power, 0.0), dtype=np.float32)

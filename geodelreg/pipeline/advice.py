@@ -1,0 +1,68 @@
+"""What a user should know about a solution beyond its figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodelreg.fit.select import spatial_blocks
+from geodelreg.pipeline.search import Hypothesis
+from geodelreg.pipeline.solve import Solution
+from geodelreg.pipeline.state import Pair
+from geodelreg.types import FloatArray
+
+_LOCAL_RMS_PX = 0.3
+_LOCAL_SIGNIFICANCE = 3.0
+_BLOCKS = 4
+_LEAST_PER_BLOCK = 4
+
+
+def warnings_of(pair: Pair, solution: Solution, hypothesis: Hypothesis) -> tuple[str, ...]:
+    """Warnings about a solution, in plain words."""
+    notes: list[str] = []
+    if not pair.source_is_coarser:
+        notes.append(
+            f"MS pixels ({pair.source_gsd_m[0]:.4g} m) are finer than the reference's "
+            f"({pair.reference_gsd_m[0]:.4g} m): matched at the reference's resolution"
+        )
+    if pair.mapping.operation.warning:
+        notes.append(pair.mapping.operation.warning)
+    if hypothesis.bright is not None:
+        notes.append(
+            "bright objects (clouds?) move differently from the ground and were left out"
+        )
+    if solution.transformation.model in ("similarity", "affine"):
+        notes.append(
+            "the correction rotates the raster: its geotransform is no longer north-up, which GDAL's "
+            "pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
+        )
+    local = local_distortion(pair, solution)
+    if local > _LOCAL_RMS_PX:
+        notes.append(
+            f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
+            "(terrain, or bands that do not agree); a local warp would be needed"
+        )
+    return tuple(notes)
+
+
+def local_distortion(pair: Pair, solution: Solution) -> float:
+    """RMS of what is left over smoothly, in PAN pixels; 0 when it is within the noise.
+
+    Residuals are averaged over blocks; their variance beyond that of the noise is distortion.
+    """
+    points = solution.tie_points
+    kept = points.kept
+    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK:
+        return 0.0
+    block = spatial_blocks(points.source_px[kept], _BLOCKS)
+    residual = points.residual_px[kept]
+    means, noise = [], []
+    for number in np.unique(block):
+        members: FloatArray = residual[block == number]
+        if len(members) >= _LEAST_PER_BLOCK:
+            means.append(np.median(members, axis=0))
+            noise.append(1.57 * members.var(axis=0, ddof=1) / len(members))
+    if len(means) < _BLOCKS:
+        return 0.0
+    excess = np.mean(np.square(means), axis=0) - np.mean(noise, axis=0)
+    doubt = _LOCAL_SIGNIFICANCE * np.mean(noise, axis=0) * np.sqrt(2 / len(means))
+    return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))

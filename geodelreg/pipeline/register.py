@@ -1,0 +1,179 @@
+"""The whole method on one page: it asks readers for windows, opens no file and prints nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from geodelreg.errors import AlignmentRefusedError, NoDataError, NoOverlapError
+from geodelreg.fit.models import IDENTITY
+from geodelreg.geo.affine import affine_from_matrix
+from geodelreg.match.area import best_shift
+from geodelreg.match.surface import make_surface
+from geodelreg.options import AlignOptions
+from geodelreg.pipeline.advice import warnings_of
+from geodelreg.pipeline.baseline import solve_baseline
+from geodelreg.pipeline.evidence import overlay
+from geodelreg.pipeline.search import (
+    Hypothesis,
+    WorkingPair,
+    keypoint_hypotheses,
+    mean_band,
+    read_working_pair,
+    scopes,
+)
+from geodelreg.pipeline.solve import Solution, solve
+from geodelreg.pipeline.state import Pair, Progress, make_pair
+from geodelreg.pipeline.tiles import roles
+from geodelreg.types import Correction, WindowReader
+
+logger = logging.getLogger(__name__)
+
+
+def register(
+    source: WindowReader,
+    reference: WindowReader,
+    options: AlignOptions,
+    progress: Progress | None = None,
+) -> tuple[Pair, Solution]:
+    """Find the correction of the source's header, with its evidence.
+
+    Hypotheses come from keypoints, coarse first, then from area correlation around the header; each
+    is refined and judged, and the first that the evidence supports is taken.
+
+    Parameters
+    ----------
+    source, reference : WindowReader
+        MS and PAN.
+    options : AlignOptions
+    progress : callable, optional
+        Called with a fraction 0 to 1 and the name of the step.
+
+    Returns
+    -------
+    pair : Pair
+    solution : Solution
+        Its verdict may be a refusal.
+
+    Raises
+    ------
+    NoOverlapError
+        When headers and contents share no ground.
+    NoDataError
+        When a band has no texture where it matters.
+    """
+    report = progress or (lambda fraction, step: None)
+    pair = make_pair(source, reference, options)
+    start = perf_counter()
+    refused: Solution | None = None
+    looked = 0.0
+    report(0.02, "reading")
+    for hypothesis in hypotheses(pair):
+        report(0.4 + looked / 4, "refining")
+        found = perf_counter() - start
+        run = solve if options.method == "delaunay" else solve_baseline
+        solution = run(pair, hypothesis)
+        if solution is not None:
+            solution = _finish(pair, solution, hypothesis, found)
+            if solution.verdict.accepted:
+                report(1.0, "done")
+                return pair, solution
+            refused = _better(refused, solution)
+        looked = (1.0 + looked) / 2
+    report(1.0, "refused")
+    if refused is None:
+        raise _nothing_found(pair)
+    return pair, refused
+
+
+def hypotheses(pair: Pair) -> Iterator[Hypothesis]:
+    """First guesses, the most likely first; later ones are only computed when needed."""
+    by_area: list[WorkingPair] = []
+    empty: NoDataError | None = None
+    for scope in scopes(pair):
+        images = read_working_pair(pair, scope)
+        empty = _emptiness(images)
+        if empty is not None:
+            continue
+        if not by_area:
+            by_area.append(images)
+        yield from keypoint_hypotheses(pair, images)
+    for images in by_area if pair.options.method == "delaunay" else []:
+        yield area_hypothesis(pair, images)
+    if empty is not None and not by_area:
+        raise empty
+
+
+def _emptiness(images: WorkingPair) -> NoDataError | None:
+    for band in (*images.source[:1], images.reference):
+        values = band.data[band.valid]
+        if values.size == 0 or float(values.min()) == float(values.max()):
+            what = "no valid pixel" if values.size == 0 else f"the constant value {values[0]:g}"
+            return NoDataError(
+                f"{band.name} has {what} where the rasters overlap",
+                "Choose another band, or check the no-data value and the mask.",
+            )
+    return None
+
+
+def area_hypothesis(pair: Pair, images: WorkingPair) -> Hypothesis:
+    """The shift at which edges correlate best, for pairs whose keypoints do not match."""
+    part = roles(pair)
+    ms = mean_band(images.source)
+    template, finer = (ms, images.reference) if part.ms_is_template() else (images.reference, ms)
+    surface = make_surface(finer, part.surface.grid, (0.5, 0.5))
+    view = overlay(part, template, surface, IDENTITY)
+    shift = best_shift(view, template.valid, view.usable)
+    step = ~part.template.grid.transform @ template.grid.transform
+    moved = np.array([[0.0, 0.0]]) + shift * np.array([step.a, step.e])
+    matrix = IDENTITY.copy()
+    if part.ms_is_template():
+        matrix[:, 2] = moved[0]
+    else:
+        # template pixel x shows what the surface has at x + shift: carry that to MS pixels
+        ends = part.to_surface(IDENTITY, np.stack([moved[0], np.zeros(2)]))
+        matrix[:, 2] = ends[1] - ends[0]
+    return Hypothesis(matrix, float("nan"), {}, images)
+
+
+def _finish(pair: Pair, solution: Solution, hypothesis: Hypothesis, found_s: float) -> Solution:
+    return replace(
+        solution,
+        warnings=solution.warnings + warnings_of(pair, solution, hypothesis),
+        timings_s={"search": found_s, **solution.timings_s},
+    )
+
+
+def _better(one: Solution | None, other: Solution) -> Solution:
+    """Of two refused solutions the one that passed more of the gate, for the report."""
+    if one is None:
+        return other
+    passed = [sum(reason.passed for reason in s.verdict.reasons) for s in (one, other)]
+    return other if passed[1] > passed[0] else one
+
+
+def _nothing_found(pair: Pair) -> Exception:
+    names = f"{pair.source.name} and {pair.reference.name}"
+    if next(scopes(pair)).name == "both rasters whole":
+        return NoOverlapError(
+            f"{names} do not overlap by their headers, and their contents do not match",
+            "Check that both show the same ground and that CRSs and geotransforms are right.",
+        )
+    return AlignmentRefusedError(
+        f"{names}: no transformation was found that enough places agree on",
+        "Check that both show the same ground; try --band with the band that looks most like PAN, "
+        "or a larger --search-radius.",
+    )
+
+
+def correction_of(pair: Pair, solution: Solution) -> Correction:
+    """The correction to write: of an unbelieved or needless one, the header as it is."""
+    original = pair.source.grid.transform
+    moves = solution.verdict.outcome.value == "aligned"
+    corrected = original @ affine_from_matrix(solution.transformation.matrix) if moves else original
+    model = solution.transformation.model if moves else "none"
+    return Correction(model, pair.source.grid.crs_wkt, original, corrected)
