@@ -10,8 +10,10 @@ from geodelreg.types import BoolArray, Float32Array, FloatArray, IntArray
 class BoxAverage:
     """Average of the valid pixels inside each cell of a coarser grid.
 
-    Pieces of the finer raster are added in any order; each pixel counts in a cell with the share
-    of its area that lies inside, so that cells of a non-integer size are exact.
+    Pieces of the finer raster are added in any order.  A pixel that a cell border cuts is shared
+    by area, and its two parts take the slope between its neighbours into account (second-order
+    conservative remapping, Dukowicz & Kodis 1987, doi:10.1137/0908037), so that linear ramps come
+    out exact at any ratio.
 
     Parameters
     ----------
@@ -54,13 +56,14 @@ class BoxAverage:
         columns = _Cells(column, data.shape[2], self._origin[0], self._ratio[0], self._counts[0])
         target = (slice(None), rows.cells, columns.cells)
         if valid is None:
-            data_sum = columns.fold(rows.fold(data, 1), 2)
-            area = np.multiply.outer(rows.areas(), columns.areas())[None]
+            total = columns.fold(rows.fold(data, None, 1), None, 2)
+            self._area[target] += np.multiply.outer(rows.areas(), columns.areas())
         else:
-            data_sum = columns.fold(rows.fold(data, 1), 2)
-            area = columns.fold(rows.fold(valid.astype(np.float32), 1), 2)
-        self._sum[target] += data_sum
-        self._area[target] += area
+            share = valid.astype(np.float32)
+            row_area = rows.fold(share, None, 1, constant=True)
+            total = columns.fold(rows.fold(data, share, 1), row_area, 2)
+            self._area[target] += columns.fold(row_area, None, 2, constant=True)
+        self._sum[target] += total
 
     def result(self) -> tuple[Float32Array, BoolArray]:
         """Averages (B, H, W) float32 and (B, H, W) bool, True where half the cell was valid."""
@@ -84,31 +87,67 @@ class _Cells:
         self._starts: IntArray = np.flatnonzero(np.diff(first, prepend=first[0] - 1))
         self._first = first - self._low
         self._split: IntArray = np.flatnonzero(share < 1.0)
-        self._rest = 1.0 - share[self._split]
+        self._share = share[self._split]
         self._inside = slice(max(-self._low, 0), min(count, self._high + 1) - self._low)
         self.cells = slice(max(self._low, 0), min(count, self._high + 1))
 
     def areas(self) -> FloatArray:
         """(n,) float64 pixels that fall into each of `cells`."""
         ones = np.ones((1, len(self._first), 1), dtype=np.float32)
-        return self.fold(ones, 1)[0, :, 0].astype(np.float64)
+        return self.fold(ones, None, 1, constant=True)[0, :, 0].astype(np.float64)
 
-    def fold(self, data: Float32Array, axis: int) -> Float32Array:
-        """Sum `data` (3-D) along `axis` into `cells`."""
-        moved = list(data.shape)
-        moved[axis] = self._high - self._low + 1
-        out = np.zeros(moved, dtype=np.float32)
-        out_along, data_along = out.swapaxes(0, axis), data.swapaxes(0, axis)
+    def fold(
+        self, total: Float32Array, area: Float32Array | None, axis: int, constant: bool = False
+    ) -> Float32Array:
+        """Sum along an axis into `cells`.
+
+        Parameters
+        ----------
+        total : 3-D float32
+            Sums over pixels.
+        area : 3-D float32 or None
+            Numbers of pixels behind them; None when they are all equal.
+        axis : int
+            1 (rows) or 2 (columns).
+        constant : bool
+            The two parts of a cut pixel have the same value, whatever its neighbours.
+        """
+        shape = list(total.shape)
+        shape[axis] = self._high - self._low + 1
+        out = np.zeros(shape, dtype=np.float32)
+        out_along, along = out.swapaxes(0, axis), total.swapaxes(0, axis)
         cells = self._first[self._starts]
-        if axis == data.ndim - 1:
-            out[..., cells] = np.add.reduceat(data, self._starts, axis=axis)
-        else:
-            stops = np.append(self._starts[1:], data.shape[axis])
+        if axis == total.ndim - 1:
+            out[..., cells] = np.add.reduceat(total, self._starts, axis=axis)
+        else:  # ten times faster than reduceat
+            stops = np.append(self._starts[1:], len(along))
             for cell, begin, end in zip(cells, self._starts, stops, strict=True):
-                data_along[begin:end].sum(axis=0, out=out_along[cell])
+                along[begin:end].sum(axis=0, out=out_along[cell])
         if len(self._split):
-            rest = self._rest.astype(np.float32).reshape(-1, 1, 1) * data_along[self._split]
+            slope = None if constant else _slopes(along, area, self._split, axis)
+            rest = self._beyond_border(along[self._split], slope)
             at = self._first[self._split]
             out_along[at] -= rest
             out_along[at + 1] += rest
         return out_along[self._inside].swapaxes(0, axis)
+
+    def _beyond_border(self, cut: Float32Array, slope: Float32Array | None) -> Float32Array:
+        """The part of cut pixels that falls into the next cell."""
+        share = self._share.astype(np.float32).reshape(-1, 1, 1)
+        rest = (1 - share) * cut
+        return rest if slope is None else rest + 0.5 * share * (1 - share) * slope
+
+
+def _slopes(
+    along: Float32Array, area: Float32Array | None, at: IntArray, axis: int
+) -> Float32Array:
+    """Change of `along` per pixel at some pixels; 0 where a neighbour is not valid."""
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, len(along) - 1)
+    distance = np.maximum(after - before, 1).astype(np.float32).reshape(-1, 1, 1)
+    if area is None:
+        return np.asarray((along[after] - along[before]) / distance)
+    weight = area.swapaxes(0, axis)
+    known = (weight[before] > 0) & (weight[at] > 0) & (weight[after] > 0)
+    safe = [np.where(known, weight[index], 1) for index in (before, after)]
+    change = along[after] / safe[1] - along[before] / safe[0]
+    return np.asarray(np.where(known, change * weight[at], 0) / distance, dtype=np.float32)

@@ -18,6 +18,8 @@ from geodelreg.errors import (
     UnsupportedGeoreferenceError,
 )
 from geodelreg.image.environment import gdal_calls
+from geodelreg.image.paths import is_local
+from geodelreg.image.vrt_sources import check_vrt_sources
 from geodelreg.types import Grid
 
 if TYPE_CHECKING:
@@ -25,19 +27,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_PLAUSIBLE_SIDE = 1_000_000
+_COMMON_SIDE = 1_000_000
+# the equator in pixels of 0.4 m
+_LARGEST_SIDE = 100_000_000
 # the densest lossless codecs of TIFF do not reach this
 _PIXELS_PER_BYTE = 20_000
-
-
-def is_local(path: str) -> bool:
-    """Whether `path` names a file of the file system, not a URL or one of GDAL's own schemes."""
-    return not path.startswith("/vsi") and "://" not in path and not _is_subdataset(path)
-
-
-def _is_subdataset(path: str) -> bool:
-    head, colon, _ = path.partition(":")
-    return bool(colon) and len(head) > 1 and not Path(path).exists()
 
 
 def open_dataset(path: str, overview_level: int | None = None) -> DatasetReader:
@@ -101,16 +95,21 @@ def _check_pixels(path: str, dataset: DatasetReader) -> None:
                 f"band {number} of {path} holds complex numbers",
                 "Write its amplitude to a new file first, for example with gdal_calc.py.",
             )
-    pixels = dataset.width * dataset.height
-    if (
-        max(dataset.width, dataset.height) > _PLAUSIBLE_SIDE
-        and dataset.driver == "GTiff"
-        and is_local(path)
-        and pixels > _PIXELS_PER_BYTE * Path(path).stat().st_size
-    ):
+    _check_size(path, dataset)
+    if dataset.driver == "VRT":
+        check_vrt_sources(path)
+
+
+def _check_size(path: str, dataset: DatasetReader) -> None:
+    """Refuse sizes that are certainly wrong, before anything is allocated for them."""
+    side, pixels = max(dataset.width, dataset.height), dataset.width * dataset.height
+    absurd = side > _LARGEST_SIDE
+    if side > _COMMON_SIDE and dataset.driver == "GTiff" and is_local(path):
+        absurd |= pixels > _PIXELS_PER_BYTE * Path(path).stat().st_size
+    if absurd:
         raise RasterUnreadableError(
-            f"the header of {path} claims {dataset.width} × {dataset.height} pixels, which its "
-            f"{Path(path).stat().st_size} bytes cannot hold",
+            f"the header of {path} claims {dataset.width} × {dataset.height} pixels, more than "
+            "the file can hold",
             "The file is damaged: copy or download it again.",
         )
 

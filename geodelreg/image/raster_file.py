@@ -55,10 +55,11 @@ class RasterFile:
         self.dataset = stack.enter_context(open_dataset(path))
         self.grid = dataset_grid(path, self.dataset)
         self._stack = stack
+        every = range(1, self.dataset.count + 1)
         self._alpha = alpha_bands(self.dataset)
-        self.image_bands = tuple(
-            n for n in range(1, self.dataset.count + 1) if n not in self._alpha
-        )
+        if len(self._alpha) == len(every):
+            self._alpha = ()
+        self.image_bands = tuple(number for number in every if number not in self._alpha)
         self._placements: dict[int, Placement] = {}
 
     @cached_property

@@ -238,13 +238,15 @@ def _same_grid(one: Grid, other: Grid) -> bool:
 
 
 def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
-    bands = []
+    bands: list[_FileBand] = []
     for index, file in enumerate(files):
         for number in file.image_bands:
             name = file.dataset.descriptions[number - 1] or f"band {number}"
             if len(files) > 1:
                 stem = Path(file.path).stem
                 name = stem if len(file.image_bands) == 1 else f"{stem} {name}"
+            if any(name == band.name for band in bands):
+                name = f"{name} ({len(bands) + 1})"
             bands.append(_FileBand(index, number, name))
     return bands
 
@@ -293,8 +295,14 @@ def check_band(reader: RasterReader, number: int) -> None:
         )
 
 
-def check_texture(band: Band) -> None:
+def check_texture(band: Band, file_name: str) -> None:
     """Make sure that there is something to match.
+
+    Parameters
+    ----------
+    band : Band
+    file_name : str
+        For the message.
 
     Raises
     ------
@@ -304,11 +312,11 @@ def check_texture(band: Band) -> None:
     values = band.data[band.valid]
     if values.size == 0:
         raise NoDataError(
-            f"{band.name} has no valid pixel in the area that was read",
+            f"{file_name}: {band.name} has no valid pixel where it was read",
             "Choose another band, or check the no-data value and the mask.",
         )
     if values.min() == values.max():
         raise NoDataError(
-            f"{band.name} has the same value ({values[0]:g}) everywhere in the area that was read",
+            f"{file_name}: {band.name} is constant ({values[0]:g}) where it was read",
             "Choose another band.",
         )

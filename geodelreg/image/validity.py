@@ -53,11 +53,14 @@ def differs_from_nodata(data: NDArray[Any], nodata: float | None) -> BoolArray |
     if nodata is None or not math.isfinite(nodata):
         return None
     if data.dtype.kind in "iu":
-        limits = np.iinfo(data.dtype)
-        if nodata != int(nodata) or not limits.min <= nodata <= limits.max:
+        whole = np.iinfo(data.dtype)
+        if nodata != int(nodata) or not whole.min <= nodata <= whole.max:
             return None
         differs = data != data.dtype.type(int(nodata))
     else:
+        limits = np.finfo(data.dtype)
         margin = _FLOAT_TOLERANCE * abs(nodata) if data.dtype.itemsize <= 4 else 0.0
-        differs = (data < nodata - margin) | (data > nodata + margin)
+        low = max(nodata - margin, float(limits.min))
+        high = min(nodata + margin, float(limits.max))
+        differs = (data < low) | (data > high)
     return np.asarray(differs, dtype=np.bool_)
