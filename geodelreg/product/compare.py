@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, RasterUnreadableError
-from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.affine import affine_matrix
 from geodelreg.product.geotags import DOMAIN
 from geodelreg.product.header import Provenance
 
@@ -55,17 +56,25 @@ def check_placement(out: Path, target: Path, content: Provenance, tolerance_px: 
         if content.georef == "gcps":
             good = len(dataset.gcps[0]) == len(content.gcps)
         else:
-            width, height = dataset.width, dataset.height
-            corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=float)
-            there = apply_affine(dataset.transform, corners)
-            back = apply_affine(~content.correction.corrected, there)
-            good = bool(np.abs(back - corners).max() <= tolerance_px)
+            wanted = content.correction.corrected
+            good = _displacement_px(dataset.transform, wanted, dataset.shape) <= tolerance_px
         driver = dataset.driver
     if not good:
         raise OutputUnwritableError(
             f"{target} cannot be written: {driver} does not keep this georeferencing",
             "Choose another format, e.g. --of GTiff.",
         )
+
+
+def _displacement_px(found: Affine, wanted: Affine, shape: tuple[int, int]) -> float:
+    """Largest displacement of a corner beyond what doubles resolve so far from the origin."""
+    height, width = shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=float)
+    before, after = affine_matrix(wanted), affine_matrix(found)
+    moved = np.abs(corners @ (after - before).T)
+    grain = 4 * np.spacing(np.abs(corners @ before.T).max())
+    moved = np.maximum(moved - grain, 0.0)
+    return float((moved @ np.abs(np.linalg.inv(before[:, :2])).T).max())
 
 
 def metadata_differences(

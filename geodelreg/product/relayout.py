@@ -26,6 +26,7 @@ from geodelreg.product.tiff import (
     Entry,
     Layout,
     TiffFile,
+    directory_length,
     encode_directory,
 )
 
@@ -165,8 +166,7 @@ def _front(
         entries = main_entries if number == 0 else directory.entries
         moved = [_moved(tiff, entry, layout, shift) for entry in entries]
         at = len(front)
-        length = len(encode_directory(layout, moved, at, 0))
-        following = 0 if number == last else at + length
+        following = 0 if number == last else at + directory_length(layout, moved)
         front += encode_directory(layout, moved, at, following)
     return front.ljust(-(-len(front) // _ALIGNMENT) * _ALIGNMENT, b"\0")
 

@@ -285,6 +285,12 @@ def replaced(
     return tuple(sorted([e for e in entries if e.tag not in gone] + new, key=lambda e: e.tag))
 
 
+def directory_length(layout: Layout, entries: Sequence[Entry]) -> int:
+    """Length of what `encode_directory` returns."""
+    values = [len(e.data) for e in entries if e.data and len(e.data) > layout.offset_bytes]
+    return _values_offset(layout, entries) + sum(length + length % 2 for length in values)
+
+
 def encode_directory(layout: Layout, entries: Sequence[Entry], at: int, next_offset: int) -> bytes:
     """Encode a directory for offset `at`, followed by those of its values that are new.
 
@@ -293,8 +299,7 @@ def encode_directory(layout: Layout, entries: Sequence[Entry], at: int, next_off
     bytes
         Of even length, so that another directory can follow.
     """
-    values_at = at + Directory(at, tuple(entries), 0).byte_length(layout)
-    values_at += values_at % 2
+    values_at = at + _values_offset(layout, entries)
     head, values = [layout.count(len(entries))], bytearray()
     for entry in entries:
         field = entry.field
@@ -309,5 +314,9 @@ def encode_directory(layout: Layout, entries: Sequence[Entry], at: int, next_off
         )
         head.append(kind + field)
     head.append(layout.offset(next_offset))
-    directory = b"".join(head)
-    return directory.ljust(values_at - at, b"\0") + bytes(values)
+    return b"".join(head).ljust(values_at - at, b"\0") + bytes(values)
+
+
+def _values_offset(layout: Layout, entries: Sequence[Entry]) -> int:
+    length = Directory(0, tuple(entries), 0).byte_length(layout)
+    return length + length % 2

@@ -10,7 +10,13 @@ from geodelreg.product import relayout
 from geodelreg.product.atomic import write_fully
 from geodelreg.product.copying import Unchanged, copy_range, open_source
 from geodelreg.product.header import Georeference, Metadata, Provenance, corrected_entries
-from geodelreg.product.tiff import CLASSIC_LIMIT, Entry, TiffFile, encode_directory
+from geodelreg.product.tiff import (
+    CLASSIC_LIMIT,
+    Entry,
+    TiffFile,
+    directory_length,
+    encode_directory,
+)
 
 
 def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadata = ()) -> None:
@@ -37,12 +43,11 @@ def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadat
         structure = relayout.Structure.read(tiff)
         relayout.check_complete(tiff, structure)
         entries = corrected_entries(tiff, structure.directories[0], georeference, content, more)
-        tail = appended_directory(tiff, entries)
-        if structure.is_cog or not fits(tiff, tail):
+        if structure.is_cog or not fits(tiff, entries):
             relayout.write(tiff, reading, writing, structure, entries)
         else:
             copy_range(reading, writing, 0, 0, tiff.size)
-            _append(writing, tiff, tail)
+            _append(writing, tiff, entries)
 
 
 def edit_private(path: Path, content: Provenance, more: Metadata = ()) -> None:
@@ -59,9 +64,8 @@ def edit_private(path: Path, content: Provenance, more: Metadata = ()) -> None:
         tiff = TiffFile(path, file)
         structure = relayout.Structure.read(tiff)
         entries = corrected_entries(tiff, structure.directories[0], georeference, content, more)
-        tail = appended_directory(tiff, entries)
-        if not structure.is_cog and fits(tiff, tail):
-            _append(file, tiff, tail)
+        if not structure.is_cog and fits(tiff, entries):
+            _append(file, tiff, entries)
             return
         with draft.open("w+b", buffering=0) as writing:
             relayout.write(tiff, file, writing, structure, entries)
@@ -86,11 +90,12 @@ def new_pointer(tiff: TiffFile) -> bytes:
     return tiff.layout.offset(tiff.size + tiff.size % 2)
 
 
-def fits(tiff: TiffFile, tail: bytes) -> bool:
-    """Whether the file can hold `tail` behind its end."""
-    return tiff.layout.big or tiff.size + len(tail) <= CLASSIC_LIMIT
+def fits(tiff: TiffFile, entries: Sequence[Entry]) -> bool:
+    """Whether the file can hold another directory with new values behind its end."""
+    end = tiff.size + tiff.size % 2 + directory_length(tiff.layout, entries)
+    return tiff.layout.big or end <= CLASSIC_LIMIT
 
 
-def _append(file: BinaryIO, tiff: TiffFile, tail: bytes) -> None:
-    write_fully(file.fileno(), tail, tiff.size)
+def _append(file: BinaryIO, tiff: TiffFile, entries: Sequence[Entry]) -> None:
+    write_fully(file.fileno(), appended_directory(tiff, entries), tiff.size)
     write_fully(file.fileno(), new_pointer(tiff), tiff.layout.pointer_at)
