@@ -1,0 +1,386 @@
+"""Figures of an alignment, as PNG, SVG or PDF by the extension of the path.
+
+They are drawn on `matplotlib.figure.Figure` without pyplot, so no global state is touched, and
+carry no dates: the same values give the same file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.errors import MissingExtraError, UsageError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.product.atomic import staged
+from geodelreg.types import Alignment, Band, FloatArray, Grid, IntArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_FORMATS = (".png", ".svg", ".pdf")
+_KEPT = "#ffcf33"
+_MESH = "#35d0ff"
+_REJECTED = "#ff4d4d"
+_INK = "#1f4e79"
+_ACCENT = "#d1495b"
+_LINES_AT_MOST = 40
+_ARROWS_AT_MOST = 1200
+_TILES = 6
+_MIDDLE_GREY = 0.42
+_STYLE: Any = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "svg.hashsalt": "geodelreg",
+}
+
+
+@contextmanager
+def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
+    """Figure that is written to `path`, whole or not at all, when the block ends."""
+    try:
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "figures need matplotlib", "Install it: pip install 'geodelreg[report]'."
+        ) from error
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise UsageError(
+            f"{path.name}: figures are not written as {suffix or 'files without extension'}",
+            f"Use one of: {', '.join(_FORMATS)}.",
+        )
+    with rc_context(_STYLE):
+        figure = Figure(figsize=size_in, layout="constrained")
+        yield figure
+        dates = {"Software": None} if suffix == ".png" else {"Date": None}
+        if suffix == ".pdf":
+            dates = {"CreationDate": None}
+        with staged(path, overwrite=overwrite) as work:
+            figure.savefig(work, dpi=150, metadata=dates, format=suffix[1:])
+
+
+def draw_matches(
+    ms_band: Band,
+    pan_band: Band,
+    alignment: Alignment,
+    path: str | Path,
+    *,
+    triangles: IntArray | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Both images side by side, tie points joined, with the Delaunay mesh over each.
+
+    After Zhang et al. 2013, Fig. 5.
+
+    Parameters
+    ----------
+    ms_band, pan_band : Band
+        What to show of each raster; windows and decimated reads are placed by their grids.
+    alignment : Alignment
+        Its tie points; kept ones are joined by lines (a spread of 40 of them), rejected ones faint.
+    path : str or Path
+    triangles : (T, 3) intp, optional
+        Mesh, as indices into all tie points; Delaunay's of the kept ones when not given.
+    overwrite : bool
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    points = alignment.tie_points
+    sides = [
+        (ms_band, _shown(points.source_px, alignment.source, ms_band.grid)),
+        (pan_band, _shown(points.reference_px, alignment.reference, pan_band.grid)),
+    ]
+    # both panels are one unit high
+    widths = [band.data.shape[1] / band.data.shape[0] for band, _ in sides]
+    gap = 0.06 * sum(widths)
+    total = sum(widths) + gap
+    with _figure(Path(path), (11.0, min(11.0 / total, 9.0) + 0.35), overwrite) as figure:
+        axes = figure.add_subplot()
+        if triangles is None:
+            triangles = _delaunay(points.source_px, np.flatnonzero(points.kept))
+        places = []
+        for (band, xy), left in zip(sides, (0.0, widths[0] + gap), strict=True):
+            height = band.data.shape[0]
+            _show(axes, band, (left, left + band.data.shape[1] / height, 1.0, 0.0))
+            places.append(xy / height + np.array([left, 0.0]))
+            _draw_mesh(axes, places[-1], triangles, points.kept)
+        _draw_joins(axes, places[0], places[1], points.kept)
+        axes.set(xlim=(0.0, total), ylim=(1.0, 0.0), aspect="equal")
+        axes.set_axis_off()
+        kept = int(np.count_nonzero(points.kept))
+        axes.set_title(
+            f"{ms_band.name or 'MS'}  ↔  {pan_band.name or 'PAN'}:  "
+            f"{kept} of {len(points)} tie points kept, {len(triangles)} triangles"
+        )
+
+
+def _shown(px: FloatArray, raster: Grid, shown: Grid) -> FloatArray:
+    """Raster pixels to pixels of the window or the decimated read that is shown."""
+    return apply_affine(~shown.transform @ raster.transform, px)
+
+
+def _delaunay(xy: FloatArray, indices: IntArray) -> IntArray:
+    from matplotlib.tri import Triangulation
+
+    try:
+        triangles = Triangulation(*xy[indices].T).triangles
+    except (RuntimeError, ValueError):  # fewer than three points, or all on one line
+        return np.empty((0, 3), dtype=np.intp)
+    return np.asarray(indices[triangles], dtype=np.intp)
+
+
+def _show(axes: Axes, band: Band, extent: tuple[float, float, float, float]) -> None:
+    axes.imshow(_grey(band), extent=extent, cmap="gray", vmin=0.0, vmax=1.0, interpolation="none")
+
+
+def _grey(band: Band) -> FloatArray:
+    """Values stretched to 0…1, the median to a middle grey; NaN where not valid."""
+    image: FloatArray = np.where(band.valid, band.data, np.nan).astype(np.float64)
+    if not band.valid.any():
+        return image
+    low, middle, high = np.percentile(band.data[band.valid], (1.0, 50.0, 99.0))
+    image = np.clip((image - low) / max(high - low, 1e-12), 0.0, 1.0)
+    median = np.clip((middle - low) / max(high - low, 1e-12), 0.05, 0.7)
+    stretched: FloatArray = image ** (np.log(_MIDDLE_GREY) / np.log(median))
+    return stretched
+
+
+def _draw_mesh(axes: Axes, xy: FloatArray, triangles: IntArray, kept: NDArray[np.bool_]) -> None:
+    dense = len(triangles) > 600
+    if len(triangles):
+        axes.triplot(
+            xy[:, 0], xy[:, 1], triangles, color=_MESH, lw=0.4 if dense else 0.7, alpha=0.65
+        )
+    size = 2.0 if dense else 9.0
+    (x, y), (x_out, y_out) = xy[kept].T, xy[~kept].T
+    axes.scatter(x_out, y_out, s=2 * size, marker="x", c=_REJECTED, lw=0.7, alpha=0.45, zorder=3)
+    axes.scatter(x, y, s=size, c=_KEPT, ec="black", lw=0.3, zorder=4)
+
+
+def _draw_joins(axes: Axes, left: FloatArray, right: FloatArray, kept: NDArray[np.bool_]) -> None:
+    from matplotlib.collections import LineCollection
+
+    for mask, colour, width, alpha, count in (
+        (~kept, _REJECTED, 0.5, 0.25, _LINES_AT_MOST // 2),
+        (kept, _KEPT, 0.8, 0.8, _LINES_AT_MOST),
+    ):
+        chosen = _spread(left, np.flatnonzero(mask), count)
+        segments = np.stack([left[chosen], right[chosen]], axis=1)
+        axes.add_collection(LineCollection(list(segments), colors=colour, lw=width, alpha=alpha))
+
+
+def _spread(xy: FloatArray, indices: IntArray, count: int) -> IntArray:
+    """At most `count` of the points, far from each other (farthest point first), deterministic."""
+    if len(indices) <= count:
+        return indices
+    places = xy[indices]
+    chosen = [int(np.argmin(places.sum(axis=1)))]
+    distance = np.full(len(places), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.hypot(*(places - places[chosen[-1]]).T))
+        chosen.append(int(np.argmax(distance)))
+    return indices[chosen]
+
+
+def draw_residuals(alignment: Alignment, path: str | Path, *, overwrite: bool = False) -> None:
+    """Where the tie points' residuals point to, and how they are distributed.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        Kept tie points with known residuals are drawn, where they lie in MS, as arrows from the
+        PAN position to the corrected MS position, along PAN's columns and rows.
+    path : str or Path
+    overwrite : bool
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    points = alignment.tie_points
+    known = points.kept & np.isfinite(points.residual_px).all(axis=1)
+    xy, residual = points.source_px[known], points.residual_px[known]
+    lengths = np.hypot(*residual.T)
+    ce90 = alignment.accuracy.check_ce90_px
+    if not np.isfinite(ce90) and len(lengths):
+        ce90 = float(np.percentile(lengths, 90.0))
+    limit = max(
+        [1e-3, *(value for value in (float(np.max(lengths, initial=0.0)), ce90) if value > 0)]
+    )
+    with _figure(Path(path), (11.0, 5.6), overwrite) as figure:
+        field, cloud, histogram = figure.subplot_mosaic(
+            [["field", "cloud"], ["field", "histogram"]], width_ratios=(1.7, 1.0)
+        ).values()
+        _draw_field(field, alignment.source, xy, residual, lengths)
+        _draw_cloud(cloud, residual, ce90, limit)
+        _draw_histogram(histogram, lengths, ce90, limit)
+        rmse = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
+        figure.suptitle(
+            f"Residuals of {len(lengths)} tie points: RMSE {rmse:.3g} PAN px, "
+            f"CE90 at check points {ce90:.3g} PAN px (model {alignment.correction.model})"
+        )
+
+
+def _draw_field(
+    axes: Axes, grid: Grid, xy: FloatArray, residual: FloatArray, lengths: FloatArray
+) -> None:
+    height, width = grid.shape
+    chosen = _spread(xy, np.arange(len(xy)), _ARROWS_AT_MOST)
+    if len(chosen):
+        typical = max(float(np.percentile(lengths, 90.0)), 1e-9)
+        arrows = axes.quiver(
+            xy[chosen, 0],
+            xy[chosen, 1],
+            residual[chosen, 0],
+            residual[chosen, 1],
+            lengths[chosen],
+            angles="xy",
+            scale_units="width",
+            scale=typical * 18,
+            cmap="viridis",
+            width=0.0028,
+            clip_on=False,
+        )
+        arrows.set_in_layout(False)  # those that leave the frame must not shrink it
+        key = float(f"{typical:.1g}")
+        axes.quiverkey(arrows, 0.9, 1.05, key, f"{key:g} PAN px", labelpos="W", coordinates="axes")
+        axes.figure.colorbar(arrows, ax=axes, label="length (PAN px)", shrink=0.8, pad=0.01)
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+    axes.set(xlabel="column (MS px)", ylabel="row (MS px)")
+
+
+def _draw_cloud(axes: Axes, residual: FloatArray, ce90: float, limit: float) -> None:
+    from matplotlib.patches import Circle
+
+    axes.axhline(0.0, color="0.85", lw=0.8, zorder=0)
+    axes.axvline(0.0, color="0.85", lw=0.8, zorder=0)
+    axes.scatter(residual[:, 0], residual[:, 1], s=6, c=_INK, alpha=0.5, lw=0)
+    if np.isfinite(ce90):
+        axes.add_patch(Circle((0.0, 0.0), ce90, fill=False, ec=_ACCENT, lw=1.3))
+        axes.annotate(
+            "CE90", (ce90 * 0.7071, -ce90 * 0.7071), color=_ACCENT, fontsize=8, xytext=(3, 3),
+            textcoords="offset points",
+        )  # fmt: skip
+    reach = 1.08 * limit
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    axes.set(xlabel="along columns (PAN px)", ylabel="along rows (PAN px)")
+
+
+def _draw_histogram(axes: Axes, lengths: FloatArray, ce90: float, limit: float) -> None:
+    bins = int(np.clip(np.sqrt(len(lengths)) * 1.5, 5, 40))
+    axes.hist(lengths, bins=bins, range=(0.0, limit), color=_INK, alpha=0.8)
+    if np.isfinite(ce90):
+        axes.axvline(ce90, color=_ACCENT, lw=1.3)
+        axes.annotate(
+            f"CE90 {ce90:.3g}", (ce90, 0.95), xycoords=("data", "axes fraction"), color=_ACCENT,
+            fontsize=8, xytext=(-3, 0), textcoords="offset points", ha="right", va="top",
+        )  # fmt: skip
+    axes.set(xlabel="length (PAN px)", ylabel="tie points", xlim=(0.0, limit))
+
+
+def draw_before_after(
+    pan: Band,
+    ms_before: Band,
+    ms_after: Band,
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """PAN and MS woven into a checkerboard, under the original and under the corrected header.
+
+    The second row zooms into the place with the strongest edges and lays PAN (red) over MS (cyan):
+    what does not fit shows as coloured fringes.
+
+    Parameters
+    ----------
+    pan, ms_before, ms_after : Band
+        On one pixel grid: MS as it falls on PAN's pixels before and after the correction.
+    path : str or Path
+    overwrite : bool
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    UsageError
+        If the three shapes differ.
+    """
+    if not pan.data.shape == ms_before.data.shape == ms_after.data.shape:
+        raise UsageError("before/after figures need three bands of one shape")
+    height, width = pan.data.shape
+    rows, columns = _busiest(ms_after, max(height // 4, 16), max(width // 4, 16))
+    with _figure(Path(path), (11.0, 11.0 * height / width + 0.8), overwrite) as figure:
+        grid = figure.subplots(2, 2)
+        for column, (title, ms) in enumerate((("before", ms_before), ("after", ms_after))):
+            woven, zoom = grid[0, column], grid[1, column]
+            woven.imshow(_checkerboard(pan, ms), interpolation="none")
+            woven.set_title(f"{title}: PAN (grey) and MS (tinted) in turns")
+            zoom.imshow(_red_cyan(pan, ms, rows, columns), interpolation="none")
+            zoom.set_title(f"{title}: zoom, PAN red over MS cyan")
+            _outline(woven, rows, columns)
+            for axes in (woven, zoom):
+                axes.set_axis_off()
+
+
+def _busiest(band: Band, height: int, width: int) -> tuple[slice, slice]:
+    """Block of the given size with the largest mean gradient."""
+    down, right = np.gradient(np.nan_to_num(_grey(band)))
+    strength = np.where(band.valid, np.hypot(down, right), 0.0)
+    total = np.pad(strength.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    sums = (
+        total[height:, width:]
+        - total[:-height, width:]
+        - total[height:, :-width]
+        + total[:-height, :-width]
+    )
+    top, left = np.unravel_index(int(np.argmax(sums)), sums.shape)
+    return slice(int(top), int(top) + height), slice(int(left), int(left) + width)
+
+
+def _like(band: Band, model: Band) -> FloatArray:
+    """Values of a band stretched so that its mean and deviation are those of the model's grey."""
+    grey, target = _grey(band), _grey(model)
+    both = band.valid & model.valid
+    if not both.any():
+        return grey
+    spread = max(float(grey[both].std()), 1e-6)
+    matched = (grey - grey[both].mean()) * (target[both].std() / spread) + target[both].mean()
+    clipped: FloatArray = np.clip(matched, 0.0, 1.0)
+    return clipped
+
+
+def _checkerboard(pan: Band, ms: Band) -> NDArray[Any]:
+    height, width = pan.data.shape
+    side = max(1, round(min(height, width) / _TILES))
+    rows, columns = np.indices((height, width)) // side
+    tint = np.array([1.0, 0.93, 0.72])
+    grey, tinted = _grey(pan)[..., None] * np.ones(3), _like(ms, pan)[..., None] * tint
+    image = np.where(((rows + columns) % 2 == 0)[..., None], grey, tinted)
+    return np.nan_to_num(image, nan=1.0)
+
+
+def _red_cyan(pan: Band, ms: Band, rows: slice, columns: slice) -> NDArray[Any]:
+    red, cyan = _grey(pan)[rows, columns], _like(ms, pan)[rows, columns]
+    return np.nan_to_num(np.stack([red, cyan, cyan], axis=-1), nan=1.0)
+
+
+def _outline(axes: Axes, rows: slice, columns: slice) -> None:
+    from matplotlib.patches import Rectangle
+
+    size = (columns.stop - columns.start, rows.stop - rows.start)
+    axes.add_patch(
+        Rectangle((columns.start - 0.5, rows.start - 0.5), *size, fill=False, ec=_ACCENT, lw=1.5)
+    )
