@@ -262,8 +262,10 @@ def _run(request: Request) -> None:
 def _write(alignment: Alignment, request: Request) -> None:
     """Write the raster first: what it can refuse must leave no side files behind."""
     import geodelreg
+    from geodelreg_cli.figure import bands_to_show
 
     overwrite = request.write_options.overwrite
+    shown = None if request.figure is None else bands_to_show(alignment)
     warnings: list[str] = []
     if request.in_place:
         warnings = geodelreg.write_in_place(alignment)
@@ -273,10 +275,10 @@ def _write(alignment: Alignment, request: Request) -> None:
         logging.getLogger(__name__).warning("warning: %s", warning)
     for path in request.gcps:
         geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite=overwrite)
-    if request.figure is not None:
-        from geodelreg.product.figures import write_figure
+    if request.figure is not None and shown is not None:
+        from geodelreg.product.figures import draw_matches
 
-        write_figure(alignment, request.figure)
+        draw_matches(*shown, alignment, request.figure, overwrite=overwrite)
 
 
 def _publish_report(text: str, request: Request) -> None:
