@@ -135,7 +135,9 @@ class _Cells:
         """The part of cut pixels that falls into the next cell."""
         share = self._share.astype(np.float32).reshape(-1, 1, 1)
         rest = (1 - share) * cut
-        return rest if slope is None else rest + 0.5 * share * (1 - share) * slope
+        if slope is not None:
+            rest += 0.5 * share * (1 - share) * slope
+        return rest
 
 
 def _slopes(

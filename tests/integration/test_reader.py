@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import rasterio
 from affine import Affine
 from rasterio.enums import ColorInterp
-from rasterio.env import get_gdal_config
+from rasterio.env import get_gdal_config, set_gdal_config
 
 from geodelreg.errors import BandGridError, BandNumberError, NoDataError, UsageError
 from geodelreg.image.reader import check_band, check_texture, open_raster
@@ -250,24 +251,29 @@ def test_large_blocks_are_named(write_raster: WriteRaster) -> None:
 
 
 class TestGdalState:
+    @pytest.fixture
+    def usual_cache(self) -> Iterator[int]:
+        original = get_gdal_config("GDAL_CACHEMAX")
+        set_gdal_config("GDAL_CACHEMAX", 300_000_000)
+        yield 300_000_000
+        set_gdal_config("GDAL_CACHEMAX", original)
+
     def test_cache_is_small_while_reading_and_restored_after(
-        self, write_raster: WriteRaster
+        self, write_raster: WriteRaster, usual_cache: int
     ) -> None:
         path = write_raster("a.tif", TEXTURE)
-        before = get_gdal_config("GDAL_CACHEMAX")
         first, second = open_raster(path), open_raster(path)
         assert get_gdal_config("GDAL_CACHEMAX") <= 64_000_000
         first.close()
         assert get_gdal_config("GDAL_CACHEMAX") <= 64_000_000
         second.close()
-        assert get_gdal_config("GDAL_CACHEMAX") == before
+        assert get_gdal_config("GDAL_CACHEMAX") == usual_cache
 
-    def test_cache_is_restored_after_a_failed_open(self, tmp_path: Path) -> None:
-        before = get_gdal_config("GDAL_CACHEMAX")
+    def test_cache_is_restored_after_a_failed_open(self, tmp_path: Path, usual_cache: int) -> None:
         (tmp_path / "text.tif").write_text("no raster")
         with pytest.raises(Exception, match="text"):
             open_raster(tmp_path / "text.tif")
-        assert get_gdal_config("GDAL_CACHEMAX") == before
+        assert get_gdal_config("GDAL_CACHEMAX") == usual_cache
 
     def test_reading_leaves_no_files_behind(self, write_raster: WriteRaster) -> None:
         path = write_raster("a.tif", TEXTURE)

@@ -120,3 +120,9 @@ def test_footprint_of_a_raster_in_itself_is_its_frame() -> None:
 def test_footprint_that_cannot_be_followed_is_none() -> None:
     assert footprint_in(WORLD, PAN, map_points) is None
     assert footprint_in(PAIRS["antimeridian"][0], WORLD, map_points) is None
+
+
+def test_footprint_torn_at_the_antimeridian_is_no_frame_around_the_rest() -> None:
+    # straight edges in both CRSs: the torn outline is a valid polygon, 358 degrees wide
+    mercator_150_east = grid(Affine(1000, 0, 3_228_000, 0, -1000, 4e5), (300, 222), 3832)
+    assert footprint_in(mercator_150_east, WORLD, map_points) is None
