@@ -12,7 +12,7 @@ import click
 
 from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg_cli.console import configure_logging, progress_bar
+from geodelreg_cli.console import configure_logging, log_steps, progress_bar
 from geodelreg_cli.options import (
     GCP_FORMAT,
     SectionCommand,
@@ -244,19 +244,28 @@ def _run(request: Request) -> None:
 
     source = request.sources[0] if len(request.sources) == 1 else request.sources
     try:
-        with progress_bar(request.quiet) as progress:
+        with progress_bar(request.quiet) as bar:
             alignment = geodelreg.align(
-                source, request.reference, request.options, progress=progress
+                source, request.reference, request.options, progress=log_steps(bar)
             )
     except AlignmentRefusedError as refusal:
         if refusal.alignment is not None:
             _publish_report(report_json(refusal.alignment), request)
+            if not request.quiet:
+                click.echo(_step_counts(refusal.alignment), err=True)
         raise
     report = report_json(alignment)  # of the inputs as they are: --in-place changes one
     _write(alignment, request)
     _publish_report(report, request)
     if not request.quiet:
         click.echo(summary_text(alignment), err=True)
+        click.echo(_step_counts(alignment), err=True)
+
+
+def _step_counts(alignment: Alignment) -> str:
+    """Points that survive each step, as in the paper's "112 → 97 → 91"."""
+    counts = alignment.step_counts.items()
+    return "Points: " + " → ".join(f"{count} ({step})" for step, count in counts)
 
 
 def _write(alignment: Alignment, request: Request) -> None:

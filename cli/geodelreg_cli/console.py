@@ -23,8 +23,8 @@ class _Stderr(logging.Handler):
 def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     """Send logs to stderr: warnings always but with -q, progress of the steps with -v.
 
-    What GDAL has to say about a broken file is in the error that geodelreg raises, so GDAL's own
-    messages are shown from -v on only.
+    What GDAL has to say about a broken file is in the error that geodelreg raises, so the messages
+    of other libraries are shown from -v on only.
 
     Parameters
     ----------
@@ -44,11 +44,24 @@ def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     )
     root = logging.getLogger()
     root.handlers = [handler]
-    root.setLevel(logging.DEBUG if debug else level)
-    if not (debug or verbose):
-        logging.getLogger("rasterio").setLevel(logging.CRITICAL)
-        logging.getLogger("py.warnings").setLevel(logging.CRITICAL)
+    root.setLevel(logging.WARNING if debug or (verbose and not quiet) else logging.CRITICAL)
+    for name in ("geodelreg", "geodelreg_cli"):
+        logging.getLogger(name).setLevel(logging.DEBUG if debug else level)
     logging.captureWarnings(True)
+
+
+def log_steps(show: Progress | None) -> Progress:
+    """Log each step when it begins, at level info, and pass the progress on to a bar if any."""
+    begun: list[str] = []
+
+    def report(fraction: float, text: str) -> None:
+        if text not in begun:
+            begun.append(text)
+            logging.getLogger(__name__).info("%s", text)
+        if show is not None:
+            show(fraction, text)
+
+    return report
 
 
 @contextmanager

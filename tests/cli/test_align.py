@@ -278,3 +278,20 @@ def test_rio_plugin(pair: Path) -> None:
     )
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
+
+
+def test_the_papers_method_prints_its_point_counts(geodelreg: Command, pair: Path) -> None:
+    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "--method", "zhang2013", cwd=pair)
+    assert done.returncode in (0, 3)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("Points: ")]
+    counts = [int(part.split()[0]) for part in line.removeprefix("Points: ").split(" → ")]
+    assert len(counts) >= 5
+    assert counts[2:] == sorted(counts[2:], reverse=True)
+    assert min(counts) >= 3
+
+
+def test_verbose_names_the_steps(geodelreg: Command, pair: Path) -> None:
+    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "-v", cwd=pair)
+    assert done.returncode == 0
+    assert "geodelreg: refining\n" in done.stderr
+    assert "DEBUG" not in done.stderr
