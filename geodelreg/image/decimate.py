@@ -134,7 +134,7 @@ class _Cells:
     def _beyond_border(self, cut: Float32Array, slope: Float32Array | None) -> Float32Array:
         """The part of cut pixels that falls into the next cell."""
         share = self._share.astype(np.float32).reshape(-1, 1, 1)
-        rest = (1 - share) * cut
+        rest: Float32Array = (1 - share) * cut
         if slope is not None:
             rest += 0.5 * share * (1 - share) * slope
         return rest
