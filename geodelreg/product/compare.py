@@ -34,13 +34,17 @@ GDAL_DOMAINS = {"DERIVED_SUBDATASETS", "SUBDATASETS", "IMAGE_STRUCTURE", "Locati
 """Metadata domains that GDAL fills itself."""
 
 
-def check_placement(out: Path, target: Path, content: Provenance, tolerance_px: float) -> None:
+def check_placement(
+    out: Path | str, target: Path, content: Provenance, tolerance_px: float
+) -> None:
     """Read back through GDAL where the output lies.
 
     Parameters
     ----------
-    out, target : Path
-        The file as it is now, and its final name for messages.
+    out : Path or str
+        The file as it is now.
+    target : Path
+        Its final name, for messages.
     content : Provenance
     tolerance_px : float
         Largest displacement of a corner.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -74,8 +75,10 @@ class Georeference:
         """Read it; GDAL's errors pass through."""
         import rasterio
         from rasterio.env import get_gdal_config
+        from rasterio.errors import NotGeoreferencedWarning
 
-        with rasterio.Env():
+        with rasterio.Env(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
             ignores = str(get_gdal_config("GTIFF_POINT_GEO_IGNORE")).upper() in _TRUE
             with rasterio.open(path, GEOREF_SOURCES="INTERNAL") as inside:
                 transform = inside.transform if _is_placed(inside) else None
@@ -136,7 +139,7 @@ def _crs_entries(layout: Layout, georeference: Georeference, is_point: bool) -> 
 
     with MemoryFile(ext=".tif") as memory:
         profile = {"driver": "GTiff", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
-        with memory.open(**profile, crs=crs, transform=Affine(1, 0, 0, 0, -1, 0)) as dataset:
+        with memory.open(**profile, crs=crs, transform=Affine(1, 0, 1, 0, -1, 1)) as dataset:
             dataset.update_tags(AREA_OR_POINT="Point" if is_point else "Area")
         template = TiffFile(Path(memory.name), BytesIO(memory.read()))
     entries = [template.first_directory().find(tag) for tag in geotags.CRS_TAGS]

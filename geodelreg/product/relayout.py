@@ -92,13 +92,15 @@ class Structure:
             b"KNOWN_INCOMPATIBLE_EDITION=NO" in self.ghost
         )
 
-    @property
-    def is_cog(self) -> bool:
+    def is_cog(self, tiff: TiffFile) -> bool:
         """Tiled, directories first, and with overviews or GDAL's mark."""
         main = self.directories[0]
-        tiled = main.find(TILE_OFFSETS) is not None
-        first = self.directories_end <= self.data_start
-        return tiled and first and (self.is_marked_cog or len(self.directories) > 1)
+        if main.find(TILE_OFFSETS) is None or self.directories_end > self.data_start:
+            return False
+        if not self.is_marked_cog and not _block_extent(tiff, main)[1]:
+            return False  # nothing is stored that could come after the directories
+        kinds = [tiff.integers(directory.find(_SUBFILE_TYPE)) for directory in self.directories]
+        return self.is_marked_cog or any(len(k) and int(k[0]) & _REDUCED_IMAGE for k in kinds)
 
 
 def check_movable(tiff: TiffFile, structure: Structure) -> None:

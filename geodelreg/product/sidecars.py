@@ -37,15 +37,20 @@ def pam_path(raster: Path) -> Path:
     return beside(raster, ".aux.xml")
 
 
-def world_files(raster: Path) -> list[Path]:
-    """Existing world files of a raster."""
+def placement_sidecars(raster: Path) -> list[Path]:
+    """All names, existing or not, of side files that can hold georeferencing."""
     extension = raster.suffix.lstrip(".")
     names = ["wld"]
     if extension:
         names += [extension[0] + extension[-1] + "w", extension + "w"]
-    candidates = [raster.with_suffix("." + case) for n in names for case in (n, n.upper())]
+    world = [raster.with_suffix("." + case) for n in names for case in (n, n.upper())]
+    return [pam_path(raster), *world]
+
+
+def world_files(raster: Path) -> list[Path]:
+    """Existing world files of a raster."""
     found: list[Path] = []
-    for path in candidates:
+    for path in placement_sidecars(raster)[1:]:
         # a file system that ignores case shows one file under both spellings
         if path.is_file() and not any(path.samefile(other) for other in found):
             found.append(path)

@@ -43,7 +43,7 @@ def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadat
         structure = relayout.Structure.read(tiff)
         relayout.check_complete(tiff, structure)
         entries = corrected_entries(tiff, structure.directories[0], georeference, content, more)
-        if structure.is_cog or not fits(tiff, entries):
+        if structure.is_cog(tiff) or not fits(tiff, entries):
             relayout.write(tiff, reading, writing, structure, entries)
         else:
             copy_range(reading, writing, 0, 0, tiff.size)
@@ -64,7 +64,7 @@ def edit_private(path: Path, content: Provenance, more: Metadata = ()) -> None:
         tiff = TiffFile(path, file)
         structure = relayout.Structure.read(tiff)
         entries = corrected_entries(tiff, structure.directories[0], georeference, content, more)
-        if not structure.is_cog and fits(tiff, entries):
+        if not structure.is_cog(tiff) and fits(tiff, entries):
             _append(file, tiff, entries)
             return
         with draft.open("w+b", buffering=0) as writing:
@@ -75,7 +75,8 @@ def edit_private(path: Path, content: Provenance, more: Metadata = ()) -> None:
 def is_cog(source: Path) -> bool:
     """Whether a TIFF is cloud optimised: tiled, with its directories first."""
     with open_source(source) as file:
-        return relayout.Structure.read(TiffFile(source, file)).is_cog
+        tiff = TiffFile(source, file)
+        return relayout.Structure.read(tiff).is_cog(tiff)
 
 
 def appended_directory(tiff: TiffFile, entries: Sequence[Entry]) -> bytes:

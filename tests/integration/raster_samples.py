@@ -149,7 +149,9 @@ def description(path: Path) -> dict[str, Any]:
         bands = dataset.indexes
         own = {"DERIVED_SUBDATASETS", "GEODELREG"}
         return {
-            "profile": {k: v for k, v in dataset.profile.items() if k not in ("transform", "nodata")},
+            "profile": {
+                k: v for k, v in dataset.profile.items() if k not in ("transform", "nodata")
+            },
             "nodata": repr(dataset.nodatavals),
             "dtypes": dataset.dtypes,
             "blocks": dataset.block_shapes,

@@ -1,0 +1,234 @@
+"""The header of a TIFF corrected where it lies, whatever the size of the file.
+
+A new directory is appended and flushed to the disk, then the pointer to it is replaced in one
+write: killed at any moment, the file reads as before or as after.  GDAL's own edit passes through
+states that cannot be read.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+from xml.sax.saxutils import escape
+
+from geodelreg.errors import (
+    OutputUnwritableError,
+    RasterNotFoundError,
+    UnsafeInPlaceError,
+)
+from geodelreg.product import compare, relayout, sidecars, undo
+from geodelreg.product.atomic import exclusive, unwritable
+from geodelreg.product.environment import gdal_session
+from geodelreg.product.geotiff import check_source
+from geodelreg.product.header import Georeference, Provenance, corrected_entries
+from geodelreg.product.tiff import TiffFile, is_tiff
+from geodelreg.product.tiffwrite import appended_directory, fits, new_pointer
+from geodelreg.product.undo import Edit, SidecarChange, State
+from geodelreg.types import Correction, Gcp
+
+logger = logging.getLogger(__name__)
+
+_EXACT_PX = 1e-6
+_TO_OUT = "Write the result to another file (OUT) instead of --in-place."
+
+
+def edit_in_place(
+    path: Path, correction: Correction, gcps: Sequence[Gcp], tags: Mapping[str, str]
+) -> list[str]:
+    """Correct the header of a TIFF without copying or touching its pixels.
+
+    Parameters
+    ----------
+    path : Path
+        The raster; a symbolic link is followed.
+    correction : Correction
+        ``corrected`` becomes its geotransform.
+    gcps : sequence of Gcp
+        Kept as JSON in the metadata domain ``GEODELREG``.
+    tags : mapping of str to str
+        Provenance, ``GEODELREG_*``.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    UnsafeInPlaceError
+        No TIFF, a COG (its layout would break), or a classic TIFF at its limit of 4 GB.
+    OutputUnwritableError
+        The file or its folder is read-only, or the disk is full.
+    FileLockedError
+        Another process is writing the file.
+    RasterNotFoundError, RasterUnreadableError
+    """
+    content = Provenance(correction, gcps, tags)
+    raster = Path(os.path.realpath(path))
+    with gdal_session(), _opened(path, raster) as file:
+        edits = _recovered(raster, file)
+        check_source(raster)
+        notes = []
+        if edits and edits[-1].state(raster, file) is State.FOREIGN:
+            notes.append(f"{path}: changed by another program since; earlier edits stay for good")
+            edits = []
+        edit = _planned(path, raster, file, content)
+        if _has_rpc(raster):
+            notes.append(f"{path}: its RPCs do not know the correction; write to OUT to drop them")
+        try:
+            undo.save(raster, [*edits, edit])
+            edit.apply(raster, file)
+        except BaseException:
+            edit.undo(raster, file)
+            undo.save(raster, edits)
+            raise
+    return notes
+
+
+def revert(path: Path) -> None:
+    """Take back all edits in place: the file is bit by bit what it was before the first.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    UnsafeInPlaceError
+        There is no record of an edit, or another program has changed the file since.
+    OutputUnwritableError, FileLockedError, RasterNotFoundError
+    """
+    raster = Path(os.path.realpath(path))
+    with _opened(path, raster) as file:
+        edits = undo.load(raster)
+        if not edits:
+            raise UnsafeInPlaceError(
+                f"{path} has no record of an edit in place",
+                f"The record would be {undo.record_path(raster).name} in the same folder.",
+            )
+        while edits:
+            if edits[-1].state(raster, file) is State.FOREIGN:
+                raise UnsafeInPlaceError(
+                    f"{path} was changed by another program after its header was edited",
+                    "Taking the edit back would lose those changes; use a backup.",
+                )
+            edits[-1].undo(raster, file)
+            edits.pop()
+            undo.save(raster, edits)
+
+
+@contextmanager
+def _opened(path: Path, raster: Path) -> Iterator[BinaryIO]:
+    """Open a raster for an edit, under its lock."""
+    if not raster.is_file():
+        raise RasterNotFoundError(f"{path} does not exist", "Check the name.")
+    if not is_tiff(raster):
+        raise UnsafeInPlaceError(f"{path} is no TIFF, its header cannot be edited", _TO_OUT)
+    if not os.access(raster, os.W_OK):
+        raise OutputUnwritableError(
+            f"{path} cannot be written: the file is read-only", "Change its permissions."
+        )
+    with exclusive(raster):
+        try:
+            with raster.open("r+b", buffering=0) as file:
+                yield file
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+
+def _recovered(raster: Path, file: BinaryIO) -> list[Edit]:
+    """Edits on record, after taking back one that was interrupted."""
+    edits = undo.load(raster)
+    if edits and edits[-1].state(raster, file) in (State.NONE, State.STARTED):
+        logger.warning("%s: taking back an edit that was interrupted", raster)
+        edits[-1].undo(raster, file)
+        edits.pop()
+        undo.save(raster, edits)
+    return edits
+
+
+def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance) -> Edit:
+    tiff = TiffFile(raster, file)
+    structure = relayout.Structure.read(tiff)
+    relayout.check_complete(tiff, structure)
+    if structure.is_cog(tiff):
+        raise UnsafeInPlaceError(
+            f"{path} is a cloud optimised GeoTIFF, an edit in place would break its layout", _TO_OUT
+        )
+    georeference = Georeference.read(raster)
+    entries = corrected_entries(tiff, structure.directories[0], georeference, content)
+    if not fits(tiff, entries):
+        raise UnsafeInPlaceError(
+            f"{path} is a classic TIFF at its limit of 4 GB, nothing can be appended", _TO_OUT
+        )
+    edit = Edit(
+        tiff.size,
+        tiff.layout.pointer_at,
+        tiff.layout.offset(tiff.first_offset),
+        new_pointer(tiff),
+        appended_directory(tiff, entries),
+        _sidecar_changes(path, raster, content),
+    )
+    with _preview(raster, edit, tiff.layout.header_bytes) as name:
+        compare.check_placement(name, path, content, _EXACT_PX)
+    return edit
+
+
+def _sidecar_changes(path: Path, raster: Path, content: Provenance) -> tuple[SidecarChange, ...]:
+    """Side files that would contradict the new header: PAM overrides it, world files go stale."""
+    changes = []
+    pam = sidecars.pam_path(raster)
+    if pam.is_file():
+        before = pam.read_bytes()
+        try:
+            after = sidecars.without_placement(before)
+        except ValueError as error:
+            raise UnsafeInPlaceError(
+                f"{pam} may override the header of {path.name}, and is no PAM file ({error})",
+                "Remove or repair it.",
+            ) from error
+        if after != before:
+            changes.append(SidecarChange(pam.name, before, after))
+    text = sidecars.world_file_text(content.correction.corrected).encode()
+    worlds = [(path, path.read_bytes()) for path in sidecars.world_files(raster)]
+    changes += [SidecarChange(path.name, old, text) for path, old in worlds if old != text]
+    return tuple(changes)
+
+
+@contextmanager
+def _preview(raster: Path, edit: Edit, header_bytes: int) -> Iterator[str]:
+    """Yield a name under which GDAL reads the file as it will be."""
+    from rasterio.io import MemoryFile
+
+    with raster.open("rb") as file:
+        header = file.read(header_bytes)
+    header = header[: edit.pointer_at] + edit.new_pointer
+    with MemoryFile(header) as start, MemoryFile(edit.tail) as end:
+        parts = [
+            (start.name, 0, 0, header_bytes),
+            (str(raster), header_bytes, header_bytes, edit.size - header_bytes),
+            (end.name, edit.size, 0, len(edit.tail)),
+        ]
+        xml = f"<VSISparseFile><Length>{edit.size + len(edit.tail)}</Length>"
+        for name, place, offset, length in parts:
+            xml += (
+                f"<SubfileRegion><Filename>{escape(name)}</Filename>"
+                f"<DestinationOffset>{place}</DestinationOffset>"
+                f"<SourceOffset>{offset}</SourceOffset><RegionLength>{length}</RegionLength>"
+                "</SubfileRegion>"
+            )
+        xml += "</VSISparseFile>"
+        with MemoryFile(os.fsencode(xml), ext=".xml") as description:
+            yield f"/vsisparse/{description.name}"
+
+
+def _has_rpc(raster: Path) -> bool:
+    import rasterio
+
+    with rasterio.open(raster) as dataset:
+        namespaces: Any = dataset.tag_namespaces()
+    return "RPC" in namespaces
