@@ -17,7 +17,7 @@ from geodelreg.image.decimate import BoxAverage
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
-from geodelreg.image.validity import alpha_bands, differs_from_nodata, has_mask_band
+from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.types import BoolArray, Float32Array, Window
 
 if TYPE_CHECKING:
@@ -61,6 +61,10 @@ class RasterFile:
             self._alpha = ()
         self.image_bands = tuple(number for number in every if number not in self._alpha)
         self._placements: dict[int, Placement] = {}
+
+    @cached_property
+    def _masked_bands(self) -> frozenset[int]:
+        return bands_with_mask(self.dataset)
 
     @cached_property
     def _overviews(self) -> tuple[DatasetReader, ...]:
@@ -177,7 +181,7 @@ class RasterFile:
             (slice(None), level.read(number, window=_slices(window)) != 0) for number in self._alpha
         ]
         for plane, number in enumerate(numbers):
-            if has_mask_band(self.dataset, number):
+            if number in self._masked_bands:
                 masks.append((plane, self._own_mask(number, window, level) != 0))
         return masks
 

@@ -239,14 +239,17 @@ def _same_grid(one: Grid, other: Grid) -> bool:
 
 def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
     bands: list[_FileBand] = []
+    taken: set[str] = set()
     for index, file in enumerate(files):
+        descriptions = file.dataset.descriptions
         for number in file.image_bands:
-            name = file.dataset.descriptions[number - 1] or f"band {number}"
+            name = descriptions[number - 1] or f"band {number}"
             if len(files) > 1:
                 stem = Path(file.path).stem
                 name = stem if len(file.image_bands) == 1 else f"{stem} {name}"
-            if any(name == band.name for band in bands):
+            if name in taken:
                 name = f"{name} ({len(bands) + 1})"
+            taken.add(name)
             bands.append(_FileBand(index, number, name))
     return bands
 

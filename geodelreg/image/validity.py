@@ -28,14 +28,15 @@ def alpha_bands(dataset: DatasetReader) -> tuple[int, ...]:
     )
 
 
-def has_mask_band(dataset: DatasetReader, band: int) -> bool:
-    """Whether the file has a mask of its own (internal or ``.msk``) for this band."""
+def bands_with_mask(dataset: DatasetReader) -> frozenset[int]:
+    """1-based numbers of the bands that have a mask of their own (internal or ``.msk``)."""
     from rasterio.enums import MaskFlags
 
-    flags = set(dataset.mask_flag_enums[band - 1])
-    if MaskFlags.alpha in flags:
-        return False
-    return MaskFlags.per_dataset in flags or not flags
+    return frozenset(
+        number
+        for number, flags in enumerate(dataset.mask_flag_enums, start=1)
+        if MaskFlags.alpha not in flags and (MaskFlags.per_dataset in flags or not flags)
+    )
 
 
 def differs_from_nodata(data: NDArray[Any], nodata: float | None) -> BoolArray | None:

@@ -134,23 +134,32 @@ def test_complex_numbers(write_raster: WriteRaster) -> None:
     assert_refused(path, errors.RasterUnreadableError, "band 1", "complex", "amplitude")
 
 
-def patch_size(path: Path, width: int, height: int) -> None:
-    """Overwrite ImageWidth and ImageLength in the directory of a little-endian classic TIFF."""
+def patch_header(path: Path, tags: dict[int, int]) -> None:
+    """Overwrite tags in the directory of a little-endian classic TIFF."""
     content = bytearray(path.read_bytes())
     start = struct.unpack_from("<I", content, 4)[0]
     for entry in range(struct.unpack_from("<H", content, start)[0]):
         at = start + 2 + 12 * entry
         tag = struct.unpack_from("<H", content, at)[0]
-        if tag in (256, 257):
-            struct.pack_into("<HII", content, at + 2, 4, 1, width if tag == 256 else height)
+        if tag in tags:
+            struct.pack_into("<HII", content, at + 2, 4, 1, tags[tag])
     path.write_bytes(bytes(content))
+
+
+WIDTH_TAG, HEIGHT_TAG, BANDS_TAG = 256, 257, 277
 
 
 @pytest.mark.parametrize("side", [0, 2_000_000, 2_000_000_000])
 def test_absurd_size_in_the_header(write_raster: WriteRaster, side: int) -> None:
     path = write_raster("a.tif", TEXTURE)
-    patch_size(path, side, side)
+    patch_header(path, {WIDTH_TAG: side, HEIGHT_TAG: side})
     assert_refused(path, errors.RasterUnreadableError)
+
+
+def test_absurd_number_of_bands_in_the_header(write_raster: WriteRaster) -> None:
+    path = write_raster("a.tif", TEXTURE)
+    patch_header(path, {BANDS_TAG: 60_000})
+    assert_refused(path, errors.RasterUnreadableError, "cannot be decoded")
 
 
 def write_vrt(path: Path, source: str, side: int = 300) -> Path:
