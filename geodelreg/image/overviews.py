@@ -68,8 +68,8 @@ def placements(shape: tuple[int, int], full_shape: tuple[int, int]) -> list[Plac
     if cells == shape and (1 / factors[0], 1 / factors[1]) != true:
         scales.append((1 / factors[0], 1 / factors[1]))
     return [
-        Placement(scale, (half * (1 - scale[0]), half * (1 - scale[1])))
-        for half in (0.0, -0.5, 0.5)
+        Placement(scale, (side * (1 - scale[0]) / 2, side * (1 - scale[1]) / 2))
+        for side in (0, -1, 1)
         for scale in scales
     ]
 
