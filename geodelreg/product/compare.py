@@ -204,8 +204,9 @@ def _check_values(before: Any, after: Any, target: Path) -> None:
     for window in windows_of(before):
         expected = _read(before, window, RasterUnreadableError, Path(before.name))
         found = _read(after, window, LossyOutputError, target)
-        if not all(_same_bytes(a, b) for a, b in zip(expected, found, strict=True)):
-            raise _lossy(target, "decoded pixels or masks differ")
+        for what, a, b in zip(("pixels", "masks"), expected, found, strict=True):
+            if not _same_bytes(a, b):
+                raise _lossy(target, f"decoded {what} differ")
 
 
 def _read(dataset: Any, window: Any, error_class: type, path: Path) -> tuple[Any, Any]:

@@ -15,7 +15,7 @@ from geodelreg.product import compare, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.header import Provenance, merged_domains
 from geodelreg.product.tiff import is_tiff
-from geodelreg.product.tiffwrite import edit_private
+from geodelreg.product.tiffwrite import edit_private, is_tiled
 from geodelreg.product.view import corrected_view
 
 logger = logging.getLogger(__name__)
@@ -133,8 +133,8 @@ def _tiff_creation(
         has_overviews = bool(dataset.overviews(1))
         inherited = dataset.driver in _TIFF_DRIVERS and is_tiff(source)
         blocks = dataset.block_shapes[0]
-        tiled = dataset.is_tiled
     if inherited:
+        tiled = is_tiled(source)
         creation |= _inherited_compression(structure, driver, user, notes)
         if driver == "GTiff":
             creation["INTERLEAVE"] = structure.get("INTERLEAVE", "PIXEL")

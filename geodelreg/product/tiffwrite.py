@@ -79,6 +79,12 @@ def is_cog(source: Path) -> bool:
         return relayout.Structure.read(tiff).is_cog(tiff)
 
 
+def is_tiled(source: Path) -> bool:
+    """Whether the blocks of a TIFF are tiles; else they are strips."""
+    with open_source(source) as file:
+        return TiffFile(source, file).first_directory().find(relayout.TILE_OFFSETS) is not None
+
+
 def appended_directory(tiff: TiffFile, entries: Sequence[Entry]) -> bytes:
     """Bytes to append to a file: padding to an even offset, then its new main directory."""
     following = tiff.first_directory().next_offset
