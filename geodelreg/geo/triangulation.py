@@ -112,8 +112,18 @@ def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
 
 def edges(triangles: IntArray) -> IntArray:
     """(E, 2) intp, every edge once: smaller index first, in ascending order."""
-    both = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return np.asarray(np.unique(both, axis=0), dtype=np.intp).reshape(-1, 2)
+    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    count = int(high.max()) + 1 if len(high) else 1
+    return np.stack(np.divmod(distinct(low * count + high), count), axis=1)
+
+
+def distinct(keys: IntArray) -> IntArray:
+    """Each value once, ascending; faster than `numpy.unique` on the few thousand here."""
+    ordered = np.sort(keys)
+    new = np.ones(len(ordered), dtype=np.bool_)
+    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
+    return ordered[new]
 
 
 def interior_edges(triangles: IntArray) -> InteriorEdges:
@@ -128,11 +138,10 @@ def interior_edges(triangles: IntArray) -> InteriorEdges:
 def neighbours(triangles: IntArray, count: int) -> Neighbours:
     """Neighbours of each of `count` points along the edges of the triangles."""
     edge = edges(triangles)
-    owner = np.concatenate([edge[:, 0], edge[:, 1]])
-    other = np.concatenate([edge[:, 1], edge[:, 0]])
-    order = np.lexsort((other, owner))
+    both = np.sort(np.concatenate([edge, edge[:, ::-1]]) @ np.array([count, 1]))
+    owner, near = np.divmod(both, max(count, 1))
     start = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
-    return Neighbours(start.astype(np.intp), other[order])
+    return Neighbours(start.astype(np.intp), near)
 
 
 def relative_altitude(xy: FloatArray, triangles: IntArray) -> FloatArray:
