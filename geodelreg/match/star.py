@@ -61,7 +61,8 @@ class Prediction(NamedTuple):
     ----------
     displacement : (T, 2) float64
     variance : (T,) float64
-        Of one component, by propagation; ``inf`` for a target without star.
+        Of one component, by propagation; distance from the target counts as more variance of a
+        member.  ``inf`` for a target without star.
     scatter : (T,) float64
         Mean square of one component around the plane, over the stated variances; far mismatches
         hardly count.
