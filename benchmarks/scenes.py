@@ -214,7 +214,7 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
         description=spec.description,
         source=imagery.source,
         ms_crs=ms_crs.to_wkt(),
-        pan_crs=imagery.crs_wkt,
+        pan_crs=pan_crs.to_wkt(),
         ms_header=tuple(header)[:6],
         ms_true=tuple(true)[:6],
         pan=tuple(pan)[:6],
@@ -230,7 +230,10 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
         return np.stack(~pan @ back.transform(*(true @ (column, row))), axis=-1)
 
     rows, columns = np.mgrid[:height, :width] + 0.5
-    step = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]) * 8 + (width / 2, height / 2)
+    step = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]) * 8 + (
+        width / 2,
+        height / 2,
+    )
     ends = to_pan(step[:, 0], step[:, 1])
     linear = np.stack([ends[1] - ends[0], ends[3] - ends[2]], axis=1) / 8
     return truth, Placement(to_pan(columns, rows), linear)
@@ -240,7 +243,7 @@ def _margin(placement: Placement, pan_shape: tuple[int, int]) -> int:
     """How far MS reaches beyond PAN, in PAN pixels, plus a little."""
     x, y = placement.centres_px[..., 0], placement.centres_px[..., 1]
     beyond = max(-x.min(), -y.min(), x.max() - pan_shape[1], y.max() - pan_shape[0], 0.0)
-    return int(math.ceil(beyond)) + 16
+    return math.ceil(beyond) + 16
 
 
 def _variants(
@@ -312,9 +315,21 @@ def write_raster(
     import rasterio
 
     with rasterio.open(
-        path, "w", driver="GTiff", dtype=data.dtype, count=data.shape[0], height=data.shape[1],
-        width=data.shape[2], crs=crs_wkt, transform=Affine(*transform), nodata=nodata, tiled=True,
-        blockxsize=256, blockysize=256, compress="deflate", predictor=2,
+        path,
+        "w",
+        driver="GTiff",
+        dtype=data.dtype,
+        count=data.shape[0],
+        height=data.shape[1],
+        width=data.shape[2],
+        crs=crs_wkt,
+        transform=Affine(*transform),
+        nodata=nodata,
+        tiled=True,
+        blockxsize=256,
+        blockysize=256,
+        compress="deflate",
+        predictor=2,
     ) as raster:
         raster.write(data)
 

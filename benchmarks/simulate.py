@@ -45,9 +45,7 @@ def affine_placement(ms_to_field: Affine, shape: tuple[int, int]) -> Placement:
     return Placement(np.stack([x, y], axis=-1), linear)
 
 
-def system_mtf(
-    fx: FloatArray, fy: FloatArray, linear: FloatArray, blur_ms_px: float
-) -> FloatArray:
+def system_mtf(fx: FloatArray, fy: FloatArray, linear: FloatArray, blur_ms_px: float) -> FloatArray:
     """Modulation transfer of an MS pixel: its box, and a Gaussian for optics and motion.
 
     Parameters
@@ -101,7 +99,10 @@ def render(field: NDArray[np.floating], placement: Placement, blur_ms_px: float)
     index = (placement.centres_px - 0.5 + pad) * factor
     return np.asarray(
         ndimage.map_coordinates(
-            smooth, [index[..., 1], index[..., 0]], order=SPLINE_ORDER, mode="mirror",
+            smooth,
+            [index[..., 1], index[..., 0]],
+            order=SPLINE_ORDER,
+            mode="mirror",
             output=np.float64,
         )
     )

@@ -24,8 +24,9 @@ class Truth:
     ms_crs, pan_crs : str
         WKT.
     ms_header, ms_true : tuple of 6 float
-        Geotransforms of the MS raster, as written in its header and as it should be: coefficients
-        ``a b c d e f`` with ``x = a·column + b·row + c``, ``y = d·column + e·row + f``, outer corner.
+        Geotransforms of the MS raster, as written in its header and as it should be: the
+        coefficients ``a b c d e f`` of ``x = a·column + b·row + c``, ``y = d·column + e·row + f``,
+        (0, 0) being the outer corner of the upper-left pixel.
     pan : tuple of 6 float
         Geotransform of the PAN raster, correct by definition.
     ms_shape, pan_shape : tuple of 2 int
