@@ -108,7 +108,7 @@ def metadata_differences(
             found.append("overviews")
         if before.mask_flag_enums != after.mask_flag_enums:
             found.append("kind of mask")
-        if any(_colormap(before, b) != _colormap(after, b) for b in bands):
+        if any(colormap(before, b) != colormap(after, b) for b in bands):
             found.append("colour table")
     lost = lost_metadata(source, out, {"RPC"} if strip_rpc else set())
     for band, domains in enumerate(lost):
@@ -182,12 +182,25 @@ def check_decodable(source: Path) -> None:
             _read(dataset, window, RasterUnreadableError, source)
 
 
+def numpy_type(name: str) -> str:
+    """Name of the numpy type that rasterio reads a band of type `name` into."""
+    return {"complex_int16": "complex64"}.get(name, name)
+
+
+def colormap(dataset: Any, band: int) -> Any:
+    """Colour table of a band, None without one."""
+    try:
+        return dataset.colormap(band)
+    except ValueError:
+        return None
+
+
 def windows_of(dataset: Any) -> Iterator[Any]:
     """Windows of whole blocks that cover a dataset, of a bounded size over all bands."""
     from rasterio.windows import Window
 
     block_height, block_width = dataset.block_shapes[0]
-    pixel_bytes = sum(np.dtype(_numpy_type(name)).itemsize for name in dataset.dtypes)
+    pixel_bytes = sum(np.dtype(numpy_type(name)).itemsize for name in dataset.dtypes)
     pixels = max(1, _WINDOW_BYTES // pixel_bytes)
     width = min(
         dataset.width, max(block_width, pixels // block_height // block_width * block_width)
@@ -237,17 +250,6 @@ def _same(a: Any, b: Any) -> bool:
     if not isinstance(a, tuple | list):
         return bool(a == b or (a != a and b != b))
     return len(a) == len(b) and all(_same(p, q) for p, q in zip(a, b, strict=True))
-
-
-def _numpy_type(name: str) -> str:
-    return {"complex_int16": "complex64"}.get(name, name)
-
-
-def _colormap(dataset: Any, band: int) -> Any:
-    try:
-        return dataset.colormap(band)
-    except ValueError:
-        return None
 
 
 def _lost_items(

@@ -6,7 +6,8 @@ Nothing is believed: the decoded pixels are compared with the source before the 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
@@ -92,7 +93,7 @@ def rewrite(
             if driver == "VRT":
                 out.write_text(xml, encoding="utf-8")
             else:
-                creation = _LOSSLESS_DEFAULTS.get(driver, {}) | _user_creation(options)
+                creation = _LOSSLESS_DEFAULTS.get(driver, {}) | user_creation(options)
                 _create_copy(source, name, out, target, driver, creation)
         _complete_metadata(source, out, content)
     compare.check_pixels(source, out, target, overviews=driver in _TIFF_DRIVERS)
@@ -105,8 +106,23 @@ def _create_copy(
     import rasterio.shutil
 
     logger.debug("%s: %s %s", target, driver, dict(creation))
-    try:
+    with gdal_write(source, target, driver):
         rasterio.shutil.copy(name, out, driver=driver, strict=False, **creation)
+
+
+@contextmanager
+def gdal_write(source: Path, target: Path, driver: str) -> Iterator[None]:
+    """Tell whose fault it is when GDAL fails to write a raster from another.
+
+    Raises
+    ------
+    RasterUnreadableError
+        The source cannot be decoded.
+    OutputUnwritableError
+        It can, so the output cannot be written.
+    """
+    try:
+        yield
     except gdal_failures() as error:
         compare.check_decodable(source)
         raise OutputUnwritableError(
@@ -115,7 +131,8 @@ def _create_copy(
         ) from error
 
 
-def _user_creation(options: WriteOptions) -> dict[str, str]:
+def user_creation(options: WriteOptions) -> dict[str, str]:
+    """Creation options of the user, by upper-case key."""
     pairs = (option.split("=", 1) for option in options.creation_options)
     return {key.strip().upper(): value.strip() for key, value in pairs}
 
@@ -126,7 +143,7 @@ def _tiff_creation(
     """Creation options: the user's, and for the rest the source's own encoding if it is a TIFF."""
     import rasterio
 
-    user = _user_creation(options)
+    user = user_creation(options)
     creation = {"BIGTIFF": "IF_SAFER"}
     with rasterio.open(source) as dataset:
         structure = dataset.tags(ns="IMAGE_STRUCTURE")

@@ -16,7 +16,7 @@ from geodelreg.product.header import Provenance
 
 @contextmanager
 def corrected_view(
-    source: Path, content: Provenance, mask_only: bool = False
+    source: Path, content: Provenance, mask_rules: bool = False
 ) -> Iterator[tuple[str, str]]:
     """Yield name and XML of a VRT of `source` with corrected georeferencing and provenance.
 
@@ -24,7 +24,7 @@ def corrected_view(
     ----------
     source : Path
     content : Provenance
-    mask_only : bool
+    mask_rules : bool
         Leave out no-data values where the raster has a mask as well, which then rules.
     """
     import rasterio
@@ -34,20 +34,27 @@ def corrected_view(
     with MemoryFile(ext=".vrt") as plain, rasterio.open(source) as dataset:
         rasterio.shutil.copy(dataset, plain.name, driver="VRT")
         root = ElementTree.fromstring(plain.read())
-        for element, band in (
-            (root, 0),
-            *zip(root.iter("VRTRasterBand"), dataset.indexes, strict=False),
-        ):
+        sidecars.add_metadata(root, _further_domains(dataset, 0))
+        for element, band in zip(root.iter("VRTRasterBand"), dataset.indexes, strict=False):
             sidecars.add_metadata(element, _further_domains(dataset, band))
+            _set_exactly(element, "Scale", dataset.scales[band - 1])
+            _set_exactly(element, "Offset", dataset.offsets[band - 1])
     _replace_placement(root, content)
     _replace_metadata(root, content)
-    if mask_only and root.find("MaskBand") is not None:
+    if mask_rules and root.find("MaskBand") is not None:
         for band in root.findall("VRTRasterBand"):
             for element in band.findall("NoDataValue"):
                 band.remove(element)
     text: str = ElementTree.tostring(root, encoding="unicode")
     with MemoryFile(text.encode(), ext=".vrt") as corrected:
         yield corrected.name, text
+
+
+def _set_exactly(band: ElementTree.Element, tag: str, value: float) -> None:
+    """Give a number all its digits, of which GDAL writes 16."""
+    element = band.find(tag)
+    if element is not None:
+        element.text = repr(float(value))
 
 
 def _further_domains(dataset: Any, band: int) -> dict[str, dict[str, str]]:

@@ -1,0 +1,310 @@
+"""The corrected raster resampled onto a north-up grid, for software that rejects rotated ones."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from affine import Affine
+
+from geodelreg.geo.affine import apply_affine
+from geodelreg.options import WriteOptions
+from geodelreg.product import compare, sidecars
+from geodelreg.product.atomic import check_not_input, staged
+from geodelreg.product.environment import gdal_session
+from geodelreg.product.geotiff import check_source
+from geodelreg.product.header import Provenance
+from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
+from geodelreg.product.view import corrected_view
+from geodelreg.types import Correction, Grid
+
+_TOLERANCE_PX = 1e-3
+"""Of GDAL's approximation of the way between two CRSs."""
+
+_BLOCK_PX = 256
+_SNAP_PX = 1e-6
+_EXACT_PX = 1e-6
+_RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
+_NOT_CARRIED = compare.GDAL_DOMAINS | {"GEOLOCATION"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Validity:
+    """How pixels without a value are marked: by a value, by the alpha band, or by a mask."""
+
+    nodata: float | None = None
+    alpha_band: int | None = None
+
+    @property
+    def is_mask(self) -> bool:
+        return self.nodata is None and self.alpha_band is None
+
+    @classmethod
+    def of(cls, dataset: Any) -> _Validity:
+        from rasterio.enums import ColorInterp, MaskFlags
+
+        if dataset.count > 1 and dataset.colorinterp[-1] is ColorInterp.alpha:
+            return cls(alpha_band=dataset.count)
+        if MaskFlags.per_dataset in dataset.mask_flag_enums[0]:
+            return cls()
+        if dataset.nodata is not None:
+            return cls(nodata=dataset.nodata)
+        is_float = all(np.issubdtype(np.dtype(name), np.floating) for name in dataset.dtypes)
+        return cls(nodata=math.nan) if is_float else cls()
+
+
+def write_warped(
+    source: Path,
+    target: Path,
+    correction: Correction,
+    reference: Grid,
+    tags: Mapping[str, str],
+    options: WriteOptions,
+) -> list[str]:
+    """Resample the corrected source raster north-up through GDAL's warper.
+
+    Pixels that the source does not cover get its no-data value, or zero alpha, or are masked;
+    float rasters that have none of these get NaN.
+
+    Parameters
+    ----------
+    source, target : Path
+        `target` appears whole or not at all.
+    correction : Correction
+        ``corrected`` is where the pixels of `source` lie.
+    reference : Grid
+        Of the PAN raster; the target's with ``options.warp_grid == "pan"``, otherwise unused.
+    tags : mapping of str to str
+        Provenance, ``GEODELREG_*``.
+    options : WriteOptions
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    OutputExistsError, OutputIsInputError, OutputUnwritableError, FileLockedError
+    LossyOutputError
+        The format asked for would change the resampled pixels.
+    RasterNotFoundError, RasterUnreadableError, UsageError
+    """
+    check_not_input(target, [source])
+    content = Provenance(correction, (), tags)
+    with gdal_session():
+        check_source(source)
+        driver = output_driver(target, options.driver)
+        grid = _target_grid(source, correction, reference, options)
+        stale = sidecars.stale_beside(Path(os.path.realpath(target)), source)
+        with staged(target, overwrite=options.overwrite, stale=stale) as out:
+            creation = user_creation(options) if driver == "GTiff" else {}
+            draft = out
+            if driver != "GTiff":
+                draft = out.parent.parent / "warped" / "warped.tif"
+                draft.parent.mkdir()
+            with gdal_write(source, target, "GTiff"):
+                notes = _warp(source, draft, content, grid, creation, options)
+            settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
+            content = Provenance(settled, (), tags)
+            compare.check_placement(draft, target, content, _EXACT_PX)
+            if driver != "GTiff":
+                notes += rewrite(draft, out, target, content, options)
+    return notes
+
+
+def north_up_grid(correction: Correction, shape: tuple[int, int]) -> Grid:
+    """Grid that covers the corrected footprint with pixels of the original size.
+
+    It continues the original grid where that is north-up, so that rasters which shared a grid
+    before still do.
+
+    Parameters
+    ----------
+    correction : Correction
+    shape : tuple of int
+        Height and width of the raster.
+    """
+    height, width = shape
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=float)
+    places = apply_affine(correction.corrected, corners)
+    (left, bottom), (right, top) = places.min(axis=0), places.max(axis=0)
+    original = correction.original
+    if original.b == 0 and original.d == 0 and original.a > 0 and original.e < 0:
+        pixel_x, pixel_y, anchor = original.a, -original.e, (original.c, original.f)
+    else:
+        pixel_x, pixel_y = _pixel_size(original)
+        anchor = (left, top)
+    first_column = math.floor((left - anchor[0]) / pixel_x + _SNAP_PX)
+    last_column = math.ceil((right - anchor[0]) / pixel_x - _SNAP_PX)
+    first_row = math.floor((anchor[1] - top) / pixel_y + _SNAP_PX)
+    last_row = math.ceil((anchor[1] - bottom) / pixel_y - _SNAP_PX)
+    x, y = anchor[0] + first_column * pixel_x, anchor[1] - first_row * pixel_y
+    transform = Affine(pixel_x, 0.0, float(x), 0.0, -pixel_y, float(y))
+    shape = (max(1, last_row - first_row), max(1, last_column - first_column))
+    return Grid(transform, shape, correction.crs_wkt)
+
+
+def _pixel_size(transform: Affine) -> tuple[float, float]:
+    """Width and height of pixels along the map axes they are nearest to."""
+    along_columns = math.hypot(transform.a, transform.d)
+    along_rows = math.hypot(transform.b, transform.e)
+    if abs(transform.a) >= abs(transform.d):
+        return along_columns, along_rows
+    return along_rows, along_columns
+
+
+def _target_grid(
+    source: Path, correction: Correction, reference: Grid, options: WriteOptions
+) -> Grid:
+    import rasterio
+
+    if options.warp_grid == "pan":
+        grid = reference
+    else:
+        with rasterio.open(source) as dataset:
+            grid = north_up_grid(correction, dataset.shape)
+    return grid
+
+
+def _warp(
+    source: Path,
+    out: Path,
+    content: Provenance,
+    grid: Grid,
+    creation: Mapping[str, str],
+    options: WriteOptions,
+) -> list[str]:
+    import rasterio
+
+    notes: list[str] = []
+    with corrected_view(source, content, mask_rules=True) as (name, _), rasterio.open(name) as view:
+        resampling = _resampling(view, options, notes)
+        validity = _Validity.of(view)
+        if len({repr(value) for value in view.nodatavals}) > 1:
+            notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
+        profile = _profile(view, grid, validity)
+        profile |= {key.lower(): value for key, value in creation.items()}
+        with (
+            _warped(view, grid, validity, resampling) as warped,
+            rasterio.open(out, "w", **profile) as dataset,
+        ):
+            _annotate(view, dataset)
+            _copy_pixels(warped, dataset, validity)
+    _copy_overviews(source, out, "nearest" if resampling == "nearest" else "average")
+    compare.check_decodable(out)
+    return notes
+
+
+def _resampling(view: Any, options: WriteOptions, notes: list[str]) -> str:
+    from rasterio.enums import ColorInterp
+
+    if ColorInterp.palette in view.colorinterp and options.resampling != "nearest":
+        notes.append("values of a colour table cannot be averaged; resampled by nearest neighbour")
+        return "nearest"
+    return options.resampling
+
+
+def _profile(view: Any, grid: Grid, validity: _Validity) -> dict[str, Any]:
+    from rasterio.enums import ColorInterp
+
+    kinds = {np.dtype(compare.numpy_type(name)).kind for name in view.dtypes}
+    predictor = {"f": "3", "i": "2", "u": "2"}.get(kinds.pop()) if len(kinds) == 1 else None
+    photometric = {
+        (ColorInterp.red, ColorInterp.green, ColorInterp.blue): "RGB",
+        (ColorInterp.palette,): None,
+    }.get(view.colorinterp[:3], "MINISBLACK")
+    height, width = grid.shape
+    return {
+        "driver": "GTiff",
+        "height": height,
+        "width": width,
+        "count": view.count,
+        "dtype": view.dtypes[0],
+        "crs": grid.crs_wkt,
+        "transform": grid.transform,
+        "nodata": validity.nodata,
+        "tiled": "YES",
+        "blockxsize": str(_BLOCK_PX),
+        "blockysize": str(_BLOCK_PX),
+        "compress": "DEFLATE",
+        "predictor": predictor or "1",
+        "bigtiff": "IF_SAFER",
+        "interleave": view.interleaving.value if view.interleaving else "pixel",
+        **({"photometric": photometric} if photometric else {}),
+    }
+
+
+@contextmanager
+def _warped(view: Any, grid: Grid, validity: _Validity, resampling: str) -> Iterator[Any]:
+    from rasterio.enums import Resampling
+    from rasterio.vrt import WarpedVRT
+
+    height, width = grid.shape
+    settings: dict[str, Any] = {"nodata": validity.nodata, "src_nodata": validity.nodata}
+    if validity.alpha_band is not None:
+        settings = {"src_alpha": validity.alpha_band, "dst_alpha": validity.alpha_band}
+    elif validity.is_mask:
+        settings = {"add_alpha": True}
+    with WarpedVRT(
+        view,
+        crs=grid.crs_wkt,
+        transform=grid.transform,
+        width=width,
+        height=height,
+        resampling=Resampling[_RASTERIO_NAMES.get(resampling, resampling)],
+        tolerance=_TOLERANCE_PX,
+        UNIFIED_SRC_NODATA="PARTIAL",  # each band has its own gaps
+        NUM_THREADS="ALL_CPUS",
+        **settings,
+    ) as warped:
+        yield warped
+
+
+def _annotate(view: Any, dataset: Any) -> None:
+    """Give the output what describes the bands, apart from statistics of the old pixels."""
+    if view.dtypes[0] in ("uint8", "uint16"):
+        _copy_colormaps(view, dataset)
+    dataset.colorinterp = view.colorinterp
+    dataset.descriptions = view.descriptions
+    dataset.scales, dataset.offsets = view.scales, view.offsets
+    dataset.units = [unit or "" for unit in view.units]
+    for band in (0, *view.indexes):
+        domains = {"", *view.tag_namespaces(band)} - _NOT_CARRIED
+        for domain in sorted(name for name in domains if not name.startswith("xml:")):
+            items = view.tags(band, ns=domain or None)
+            kept = {k: v for k, v in items.items() if not k.startswith("STATISTICS_")}
+            dataset.update_tags(band, ns=domain or None, **kept)
+
+
+def _copy_colormaps(view: Any, dataset: Any) -> None:
+    for band in view.indexes:
+        colormap = compare.colormap(view, band)
+        if colormap is not None:
+            dataset.write_colormap(band, colormap)
+
+
+def _copy_pixels(warped: Any, dataset: Any, validity: _Validity) -> None:
+    bands = list(dataset.indexes)
+    for window in compare.windows_of(dataset):
+        dataset.write(warped.read(bands, window=window), window=window)
+        if validity.is_mask:
+            alpha = warped.read(warped.count, window=window)
+            dataset.write_mask(alpha != 0, window=window)
+
+
+def _copy_overviews(source: Path, out: Path, resampling: str) -> None:
+    import rasterio
+    from rasterio.enums import Resampling
+
+    with rasterio.open(source) as dataset:
+        factors = dataset.overviews(1)
+    if factors:
+        with rasterio.open(out, "r+") as dataset:
+            dataset.build_overviews(factors, Resampling[resampling])
