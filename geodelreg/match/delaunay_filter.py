@@ -34,6 +34,7 @@ _SURE = 16.0
 _MAX_ROUNDS = 20
 _ROBUST_FIT_ROUNDS = 12
 _MIN_POINTS = 4
+_MIN_SIGMA_PX = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +156,8 @@ def star_filter(
     if covariance_px2 is None:
         variance = np.full(count, options.sigma_px**2)
     else:
-        variance = (covariance_px2[:, 0, 0] + covariance_px2[:, 1, 1]) / 2
+        trace = covariance_px2[:, 0, 0] + covariance_px2[:, 1, 1]
+        variance = np.maximum(trace / 2, _MIN_SIGMA_PX**2)
     start = unfolded(source_xy, reference_xy)
     if start.sum() < _MIN_POINTS:
         return start
