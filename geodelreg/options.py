@@ -81,7 +81,8 @@ class AlignOptions:
         None, "Refuse a correction that rotates by more degrees than this."
     )
     max_scale: float | None = _knob(
-        None, "Refuse a correction that scales by more than this factor (or by less than its inverse)."
+        None,
+        "Refuse a correction that scales by more than this factor (or by less than its inverse).",
     )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
     seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")

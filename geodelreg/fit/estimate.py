@@ -184,7 +184,6 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
     float
         0 when the covariances already explain the residuals.
     """
-
     variances, axes = np.linalg.eigh(covariance)
     along2 = np.einsum("nji,nj->ni", axes, residual) ** 2
 

@@ -89,7 +89,9 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
             MAX_DISAGREEMENT_PX,
             "PAN px between the correction and area correlation",
         ),
-        _at_most("rival", evidence.rival, MAX_RIVAL, "relative correlation of the best rival place"),
+        _at_most(
+            "rival", evidence.rival, MAX_RIVAL, "relative correlation of the best rival place"
+        ),
     ]
     if options.max_shift_px is not None:
         reasons.append(

@@ -125,5 +125,3 @@ def transformation(model: str, parameters: FloatArray, frame: Frame) -> Transfor
     centre = np.array(frame.centre)
     offset = centre - linear @ centre + parameters[:2] * frame.span_px
     return Transformation(model, np.column_stack([linear, offset]))
-
-

@@ -131,13 +131,15 @@ def select_model(
 
 
 def _paired_t(difference: FloatArray, blocks: IntArray) -> float:
-    """t of the mean of per-block means, blocks being the independent units."""
+    """T of the mean of per-block means, blocks being the independent units."""
     good = np.isfinite(difference)
+    if good.mean() < 0.5:
+        return float("inf")
     number = np.bincount(blocks[good])
     total = np.bincount(blocks[good], weights=difference[good])
     means = total[number > 0] / number[number > 0]
     if len(means) < 3:
-        return float("inf") if difference[good].mean() > 0 else 0.0
+        return 0.0
     spread = means.std(ddof=1) / np.sqrt(len(means))
     return float(means.mean() / max(spread, 1e-12))
 

@@ -201,4 +201,3 @@ def fitted_affine(mapping: PointMapping, shape: tuple[int, int]) -> FloatArray:
         )
     design = np.column_stack([xy[good], np.ones(int(good.sum()))])
     return np.linalg.lstsq(design, image[good], rcond=None)[0].T
-

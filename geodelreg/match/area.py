@@ -27,12 +27,19 @@ class Overlay:
     Attributes
     ----------
     template, surface : (H, W) float32
-    valid : (H, W) bool
+    template_valid, surface_valid : (H, W) bool
+        Of each image by itself.
     """
 
     template: Float32Array
     surface: Float32Array
-    valid: BoolArray
+    template_valid: BoolArray
+    surface_valid: BoolArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) bool, True where both are valid."""
+        return self.template_valid & self.surface_valid
 
 
 def rival_correlation(overlay: Overlay) -> float:
@@ -64,14 +71,12 @@ def rival_correlation(overlay: Overlay) -> float:
     return float(scores.max()) / in_place
 
 
-def best_shift(overlay: Overlay, template_valid: BoolArray, surface_valid: BoolArray) -> FloatArray:
+def best_shift(overlay: Overlay) -> FloatArray:
     """Displacement at which the edges of the two images correlate best.
 
     Parameters
     ----------
     overlay : Overlay
-    template_valid, surface_valid : (H, W) bool
-        Of each image by itself.
 
     Returns
     -------
@@ -80,8 +85,8 @@ def best_shift(overlay: Overlay, template_valid: BoolArray, surface_valid: BoolA
         this, to about a pixel of the overlay.
     """
     scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
-    one, one_mask = _edges(*_detail(overlay.template, template_valid, scale))
-    other, other_mask = _edges(*_detail(overlay.surface, surface_valid, scale))
+    one, one_mask = _edges(*_detail(overlay.template, overlay.template_valid, scale))
+    other, other_mask = _edges(*_detail(overlay.surface, overlay.surface_valid, scale))
     scores = _masked_correlation(one, one_mask, other, other_mask, _SEARCH_OVERLAP)
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     height, width = one.shape

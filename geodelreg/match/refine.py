@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geodelreg.geo.crs import linearise
 from geodelreg.geo.pixel import HALF_PIXEL
@@ -60,7 +62,8 @@ class Patches:
     ----------
     centre : (P, 2) float64
         Template raster pixels, outer corner.
-    values : (P, n * n) float32
+    values : (P, B, n * n) float32
+        One template, or several bands whose best combination is found for each patch by itself.
     valid : (P, n * n) bool
     step : (2,) float64
         Template raster pixels per patch pixel along columns and rows (1 unless decimated).
@@ -103,31 +106,32 @@ class Refined:
     status: StatusArray
 
 
-def cut_patches(band: Band, full: Grid, size: int, origins: np.ndarray | None = None) -> Patches:
-    """Cut a band into a grid of adjoining patches.
+def cut_patches(bands: list[Band], full: Grid, size: int) -> Patches:
+    """Cut bands into a grid of adjoining patches.
 
     Parameters
     ----------
-    band : Band
-        A window of the template raster, maybe decimated.
+    bands : list of Band
+        A window of the template raster, maybe decimated: one band, or several of one grid.
     full : Grid
         Grid of the full template raster.
     size : int
-        Side in pixels of `band`.
-    origins : (P, 2) int, optional
-        Upper-left (column, row) of each patch; by default adjoining patches that fill the band.
+        Side in pixels of the bands.
     """
-    height, width = band.data.shape
-    if origins is None:
-        rows, columns = height // size, width // size
-        top, left = (height - rows * size) // 2, (width - columns * size) // 2
-        grid_y, grid_x = np.mgrid[0:rows, 0:columns]
-        origins = np.stack([left + grid_x.ravel() * size, top + grid_y.ravel() * size], axis=1)
-    views = np.lib.stride_tricks.sliding_window_view
-    take = (origins[:, 1], origins[:, 0])
-    values = views(band.data, (size, size))[take].reshape(len(origins), -1)
-    valid = views(band.valid, (size, size))[take].reshape(len(origins), -1)
-    to_full = ~full.transform @ band.grid.transform
+    height, width = bands[0].data.shape
+    rows, columns = height // size, width // size
+    top, left = (height - rows * size) // 2, (width - columns * size) // 2
+    grid_y, grid_x = np.mgrid[0:rows, 0:columns]
+    origins = np.stack([left + grid_x.ravel() * size, top + grid_y.ravel() * size], axis=1)
+
+    def cut(image: NDArray[Any]) -> NDArray[Any]:
+        inner = image[top : top + rows * size, left : left + columns * size]
+        parts = inner.reshape(rows, size, columns, size).swapaxes(1, 2)
+        return np.ascontiguousarray(parts).reshape(len(origins), size * size)
+
+    values = np.stack([cut(band.data) for band in bands], axis=1)
+    valid = np.logical_and.reduce([cut(band.valid) for band in bands])
+    to_full = ~full.transform @ bands[0].grid.transform
     centre = origins + size / 2.0
     centre = np.stack(
         [to_full.a * centre[:, 0] + to_full.c, to_full.e * centre[:, 1] + to_full.f], axis=1
@@ -204,7 +208,7 @@ def _gauss_newton(
     move: FloatArray,
     active: np.ndarray[tuple[int], np.dtype[np.intp]],
 ) -> _Step:
-    """One step for the active patches: regress template on image, its two derivatives and 1."""
+    """One step for the active patches, from the Gram matrices of image, derivatives, template."""
     n, side = patches.size, patches.size + 2 * _MARGIN
     linear = local[active, :, :2] * patches.step
     anchor = local[active, :, 2] + np.einsum("pij,pj->pi", linear, move[active])
@@ -217,31 +221,76 @@ def _gauss_newton(
     along_x = (image[:, 1:-1, 2:] - image[:, 1:-1, :-2]).reshape(len(active), n * n) / 2
     along_y = (image[:, 2:, 1:-1] - image[:, :-2, 1:-1]).reshape(len(active), n * n) / 2
     columns = [image[:, 1:-1, 1:-1].reshape(len(active), n * n), along_x, along_y]
-    columns.append(patches.values[active])
+    columns.extend(patches.values[active].transpose(1, 0, 2))
     total = np.maximum(weight.sum(axis=1, keepdims=True), 1)
     centred = [(c - (c * weight).sum(axis=1, keepdims=True) / total) * weight for c in columns]
     stack = np.stack(centred, axis=1)
     gram = np.matmul(stack, stack.transpose(0, 2, 1)).astype(np.float64)
-    return _solve(gram, total[:, 0].astype(np.float64), good.mean(axis=1))
+    solve = _template_on_image if patches.values.shape[1] == 1 else _image_on_bands
+    return solve(gram, total[:, 0].astype(np.float64), good.mean(axis=1))
 
 
-def _solve(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
-    """Displacement from the (P, 4, 4) Gram matrices of image, d/dx, d/dy and template."""
+def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
+    """Regress the (noisy) template on image and derivatives: (P, 4, 4) image, d/dx, d/dy, template.
+
+    The displacement is the derivatives' coefficients over the image's.
+    """
     normal, right, energy = gram[:, :3, :3], gram[:, :3, 3], gram[:, 3, 3]
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-12))
-    scaled = normal / (scale[:, :, None] * scale[:, None, :])
-    solvable = (np.linalg.det(scaled) > 1e-6) & (total > 12) & (energy > 0)
-    scaled[~solvable] = np.eye(3)
-    inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    inverse, solvable = _inverted(normal)
     solution = np.einsum("pij,pj->pi", inverse, right)
-    solvable &= np.abs(solution[:, 0]) > 1e-9
+    solvable &= (total > 12) & (energy > 0) & (np.abs(solution[:, 0]) > 1e-9)
     gain = np.where(solvable, solution[:, 0], 1.0)
-    move = solution[:, 1:] / gain[:, None]
     residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
-    variance = residual / np.maximum(total - 4, 1)
-    covariance = inverse[:, 1:, 1:] * (variance / gain**2)[:, None, None]
+    variance = residual / np.maximum(total - 4, 1) / gain**2
     together = np.sqrt(np.maximum(gram[:, 0, 0] * energy, 1e-12))
-    correlation = gram[:, 0, 3] / together
+    return _step(
+        solution[:, 1:] / gain[:, None],
+        inverse[:, 1:, 1:] * variance[:, None, None],
+        gram[:, 0, 3] / together,
+        share,
+        solvable,
+    )
+
+
+def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
+    """Regress the image on bands and derivatives: (P, 3 + B, 3 + B) image, d/dx, d/dy, bands.
+
+    The bands' weights are the patch's own, so that changed fields may change in their own way.
+    """
+    normal, right, energy = gram[:, 1:, 1:], gram[:, 0, 1:], gram[:, 0, 0]
+    inverse, solvable = _inverted(normal)
+    solution = np.einsum("pij,pj->pi", inverse, right)
+    solvable &= (total > 3 * normal.shape[1]) & (energy > 0)
+    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
+    variance = residual / np.maximum(total - normal.shape[1] - 1, 1)
+    by_bands, fine = _inverted(normal[:, 2:, 2:])
+    explained = np.einsum("pi,pij,pj->p", right[:, 2:], by_bands, right[:, 2:])
+    correlation = np.sqrt(np.clip(explained / np.maximum(energy, 1e-12), 0, 1))
+    return _step(
+        -solution[:, :2], inverse[:, :2, :2] * variance[:, None, None], correlation, share,
+        solvable & fine,
+    )  # fmt: skip
+
+
+def _inverted(normal: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Inverses of (P, k, k) normal matrices, and where they exist."""
+    count = normal.shape[1]
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-12))
+    outer = scale[:, :, None] * scale[:, None, :]
+    scaled = normal / outer + np.eye(count) * 1e-9
+    solvable = np.linalg.det(scaled) > 1e-6 ** (count / 3)
+    scaled[~solvable] = np.eye(count)
+    return np.linalg.inv(scaled) / outer, solvable
+
+
+def _step(
+    move: FloatArray,
+    covariance: FloatArray,
+    correlation: FloatArray,
+    share: FloatArray,
+    solvable: BoolArray,
+) -> _Step:
+    """The step, clipped to a pixel, with patches that cannot be solved left where they are."""
     move[~solvable] = 0.0
     covariance[~solvable] = np.inf
     correlation[~solvable] = 0.0

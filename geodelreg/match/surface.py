@@ -7,7 +7,7 @@ sample (Sigg & Hadwiger 2005, GPU Gems 2, chapter 20).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -85,7 +85,9 @@ def low_pass_taps(sigma_px: float, box_px: float = 0.0) -> FloatArray:
     return taps / taps.sum()
 
 
-def make_surface(band: Band, full: Grid, sigma_px: tuple[float, float]) -> Surface:
+def make_surface(
+    band: Band, full: Grid, sigma_px: tuple[float, float], high_pass_px: float = 0.0
+) -> Surface:
     """Low-pass a band and take its spline coefficients in one separable filter.
 
     Parameters
@@ -96,6 +98,8 @@ def make_surface(band: Band, full: Grid, sigma_px: tuple[float, float]) -> Surfa
         Grid of the full raster.
     sigma_px : (float, float)
         Gaussian low-pass along columns and rows, in pixels of `band`.
+    high_pass_px : float
+        Take off a Gaussian mean of this standard deviation; 0 = do not.
     """
     filled, usable = band.data, band.valid
     taps = [low_pass_taps(sigma) for sigma in sigma_px]
@@ -104,8 +108,11 @@ def make_surface(band: Band, full: Grid, sigma_px: tuple[float, float]) -> Surfa
     prefilter = _spline_prefilter()
     kernels = [np.convolve(t, prefilter) for t in taps]
     offset = np.float32(np.mean(filled)) if filled.size else np.float32(0)
+    filled = filled - offset
+    if high_pass_px > 0:
+        filled = filled - cv2.GaussianBlur(filled, (0, 0), high_pass_px)
     coefficients = cv2.sepFilter2D(
-        filled - offset, cv2.CV_32F, kernels[0], kernels[1], borderType=cv2.BORDER_REFLECT_101
+        filled, cv2.CV_32F, kernels[0], kernels[1], borderType=cv2.BORDER_REFLECT_101
     )
     return Surface(
         np.asarray(coefficients, dtype=np.float32),
@@ -113,6 +120,16 @@ def make_surface(band: Band, full: Grid, sigma_px: tuple[float, float]) -> Surfa
         window_matrix(full, band.grid),
         float(offset),
     )
+
+
+def high_pass(band: Band, sigma_px: float) -> Band:
+    """The band less its Gaussian mean over valid pixels; `sigma_px` in its pixels."""
+    valid = band.valid.astype(np.float32)
+    level = np.float32(band.data[band.valid].mean()) if band.valid.any() else np.float32(0)
+    centred = (band.data - level) * valid
+    weight = cv2.GaussianBlur(valid, (0, 0), sigma_px)
+    mean = cv2.GaussianBlur(centred, (0, 0), sigma_px) / np.maximum(weight, 1e-3)
+    return replace(band, data=np.asarray(centred - mean, dtype=np.float32))
 
 
 def _fill(band: Band, taps: list[FloatArray]) -> tuple[Float32Array, BoolArray]:

@@ -27,9 +27,7 @@ def warnings_of(pair: Pair, solution: Solution, hypothesis: Hypothesis) -> tuple
     if pair.mapping.operation.warning:
         notes.append(pair.mapping.operation.warning)
     if hypothesis.bright is not None:
-        notes.append(
-            "bright objects (clouds?) move differently from the ground and were left out"
-        )
+        notes.append("bright objects (clouds?) move differently from the ground and were left out")
     if solution.transformation.model in ("similarity", "affine"):
         notes.append(
             "the correction rotates the raster: its geotransform is no longer north-up, which GDAL's "

@@ -7,7 +7,6 @@ from time import perf_counter
 
 import numpy as np
 
-from geodelreg.errors import NoDataError
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, weighted_fit
 from geodelreg.fit.models import Frame, transformation
 from geodelreg.fit.select import Selection, held_out
@@ -16,7 +15,6 @@ from geodelreg.image.stretch import to_uint8
 from geodelreg.match.consensus import log_nfa
 from geodelreg.match.keypoints import KeypointOptions, detect
 from geodelreg.match.zhang2013 import ZhangOptions, match_sift, match_zhang2013
-from geodelreg.pipeline.dense import Dense
 from geodelreg.pipeline.search import Hypothesis, WorkingPair, mean_band
 from geodelreg.pipeline.solve import (
     Fitted,
@@ -105,9 +103,7 @@ def _match(pair: Pair, images: WorkingPair) -> tuple[TiePoints, dict[str, int]]:
     steps = match_zhang2013 if pair.options.method == "zhang2013" else match_sift
     points, counts = steps(source, reference, ZhangOptions(ratio=pair.options.ratio))
     to_source = affine_matrix(~pair.source.grid.transform @ band.grid.transform)
-    to_reference = affine_matrix(
-        ~pair.reference.grid.transform @ images.reference.grid.transform
-    )
+    to_reference = affine_matrix(~pair.reference.grid.transform @ images.reference.grid.transform)
     linear = to_reference[:, :2] * _SIFT_SCATTER_PX
     counts = {"keypoints MS": len(source), "keypoints PAN": len(reference)} | counts
     moved = replace(

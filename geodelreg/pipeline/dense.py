@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -11,10 +12,10 @@ from affine import Affine
 
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit
 from geodelreg.geo.pixel import HALF_PIXEL
-from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan
-from geodelreg.match.consensus import consensus_affine, log_nfa, radial_residuals
-from geodelreg.match.refine import Patches, Refined, RefineOptions, cut_patches, refine
-from geodelreg.match.surface import Surface, make_surface, sample
+from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan, single_band
+from geodelreg.match.consensus import consensus_affine, radial_residuals
+from geodelreg.match.refine import Refined, RefineOptions, cut_patches, refine
+from geodelreg.match.surface import Surface, high_pass, make_surface, sample
 from geodelreg.pipeline.tiles import Roles, Tile
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Status, StatusArray
 
@@ -23,9 +24,14 @@ logger = logging.getLogger(__name__)
 DEFAULT_SIGMA = 0.5
 _SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
 _TONE_SAMPLES = 20_000
+_LEAST_SAMPLES = 64
 _SIGMA_TILES = 6
-_MIXED_SIGMA = 0.15
-_AGREEMENT_PX = (0.1, 0.3, 0.8)
+_MIXED_SIGMA = 0.03
+_CORE_SIGMAS = 1.5
+_CORE_FLOOR_PX = 0.03
+_SHIFT_SHARE = 0.15
+_AFFINE_SHARE = 0.25
+_CORE_REACH = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,10 +44,17 @@ class Tuning:
         Gaussian low-pass that brings the finer image to the coarser one's sharpness, in template
         pixels.
     tone : SyntheticPan
+    high_pass : float
+        Take off the mean over this standard deviation, in template pixels; 0 = do not.  Haze and
+        changed light are smooth, the ground's edges are not.
+    local_tone : bool
+        Weight the MS bands patch by patch instead of by `tone`; only where MS is the template.
     """
 
     sigma: float
     tone: SyntheticPan
+    high_pass: float = 0.0
+    local_tone: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +95,8 @@ def _decimation(band: Band, full: Affine) -> tuple[float, float]:
     return abs(step.a), abs(step.e)
 
 
-def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -> SyntheticPan | None:
-    """Weights of the MS bands that reproduce PAN under the current transformation."""
+def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -> SyntheticPan:
+    """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
     per_tile = max(_TONE_SAMPLES // len(tiles), 64)
     bands, target = [], []
     for tile in tiles:
@@ -97,14 +110,13 @@ def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -
         good = np.logical_and.reduce([usable[:, 0] for _, usable in fine])
         good &= np.logical_and.reduce([band.valid[take] for band in tile.template])
         coarse = np.stack([band.data[take][good] for band in tile.template])
-        smooth = np.stack(
-            [v[good, 0] + s.level for (v, _), s in zip(fine, surfaces, strict=True)]
-        )
+        smooth = np.stack([v[good, 0] + s.level for (v, _), s in zip(fine, surfaces, strict=True)])
         ms, pan = (coarse, smooth) if part.ms_is_template() else (smooth, coarse)
         bands.append(ms)
         target.append(pan[0])
     stacked, goal = np.concatenate(bands, axis=1), np.concatenate(target)
-    return fit_synthetic_pan(stacked, goal) if len(goal) >= 64 else None
+    fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= _LEAST_SAMPLES else None
+    return fitted or single_band(len(stacked), 0)
 
 
 def _lattice(
@@ -120,14 +132,19 @@ def _lattice(
     return np.stack([x, y], axis=1), (rows, columns)
 
 
-def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[Band, Surface]:
-    """The one template band and the one surface of a tile."""
-    if part.ms_is_template():
-        template, finer = tuning.tone(tile.template), tile.surface[0]
+def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Surface]:
+    """The template band (or the bands, with local tone) and the surface of a tile."""
+    if not part.ms_is_template():
+        templates, finer = tile.template[:1], tuning.tone(tile.surface)
+    elif tuning.local_tone:
+        templates, finer = tile.template, tile.surface[0]
     else:
-        template, finer = tile.template[0], tuning.tone(tile.surface)
-    sigma = surface_sigma(part, tile, tuning.sigma)
-    return template, make_surface(finer, part.surface.grid, sigma)
+        templates, finer = [tuning.tone(tile.template)], tile.surface[0]
+    sigma, wide = surface_sigma(part, tile, tuning.sigma), 0.0
+    if tuning.high_pass:
+        templates = [high_pass(band, tuning.high_pass) for band in templates]
+        wide = float(np.mean(surface_sigma(part, tile, tuning.high_pass)))
+    return templates, make_surface(finer, part.surface.grid, sigma, wide)
 
 
 def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning) -> float:
@@ -137,7 +154,7 @@ def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning
     for sigma in _SIGMA_CANDIDATES:
         total = 0.0
         for tile in chosen:
-            template, surface = tile_images(part, tile, replace(tuning, sigma=sigma))
+            (template,), surface = tile_images(part, tile, replace(tuning, sigma=sigma))
             xy, take = _lattice(template, part, 4000)
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
             good = usable[:, 0] & template.valid[take]
@@ -169,8 +186,8 @@ def match_pass(
     """Match every patch of every tile once and fit an affine to those that agree."""
 
     def one(tile: Tile) -> Refined | None:
-        template, surface = tile_images(part, tile, tuning)
-        patches = cut_patches(template, part.template.grid, options.size)
+        bands, surface = tile_images(part, tile, tuning)
+        patches = cut_patches(bands, part.template.grid, options.size)
         if not len(patches):
             return None
         return refine(patches, surface, lambda xy: part.to_surface(matrix, xy), options)
@@ -189,8 +206,8 @@ def _agreement(
 ) -> tuple[StatusArray, Estimate | None]:
     """Robust fit of an affine (a shift where points are few) to the patches that agree.
 
-    A robust mean of two motions is neither: where the patches scatter much beyond their own
-    covariances, the motion that most of them share most closely is found first.
+    A robust mean of two motions is neither: where the patches scatter beyond their own
+    covariances, the motion that many of them share to within their noise is found first.
     """
     status = status.copy()
     kept = np.flatnonzero(status == Status.KEPT)
@@ -201,31 +218,48 @@ def _agreement(
     unit = 1.0 if part.ms_is_template() else part.surface_px_per_template_px
     estimate = robust_fit(model, points.take(kept), frame)
     if np.sqrt(estimate.extra_variance_px2) > _MIXED_SIGMA * unit and model == "affine":
-        inliers = _closest_agreement(points.take(kept), unit)
+        inliers = _rigid_core(points.take(kept), unit)
         status[kept[~inliers]] = Status.CONSENSUS
         kept = kept[inliers]
-        if len(kept) < 2 * minimum_points(model):
-            return status, None
         estimate = robust_fit(model, points.take(kept), frame)
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     return status, estimate
 
 
-def _closest_agreement(points: Observations, unit: float) -> BoolArray:
-    """Points of the affine on which agreement is most surprising, over several tolerances."""
-    best, least = np.ones(len(points), dtype=bool), np.inf
-    quality = np.sqrt(points.covariance[:, 0, 0] + points.covariance[:, 1, 1])
-    for threshold in _AGREEMENT_PX:
-        found = consensus_affine(
-            points.source, points.target, quality, threshold * unit, kind="affine"
-        )
-        if not np.isfinite(found.matrix).all():
-            continue
-        residual = radial_residuals(found.matrix, points.source, points.target)
-        surprise, _ = log_nfa(residual, (3.0 * unit) ** 2, 3, threshold * unit)
-        if surprise < least:
-            best, least = residual < 2.0 * threshold * unit, surprise
-    return best
+def _rigid_core(points: Observations, unit: float) -> BoolArray:
+    """Points near the shift, or else the affine, that a fair share of them fits to within matching noise.
+
+    The ground is rigid: its patches agree to within their noise.  Clouds at various heights do not,
+    however many they are.  The tolerance starts at the noise and grows until enough points agree.
+    """
+    variance = points.covariance[:, 0, 0] + points.covariance[:, 1, 1]
+    tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance))), _CORE_FLOOR_PX * unit)
+    while tolerance <= unit:
+        residuals = list(_rigid_residuals(points, variance, tolerance))
+        shares = [float((residual <= tolerance).mean()) for residual in residuals]
+        if shares[0] >= max(_SHIFT_SHARE, 0.5 * shares[-1]):
+            return _near(residuals[0], tolerance, variance)
+        if shares[-1] >= _AFFINE_SHARE:
+            return _near(residuals[-1], tolerance, variance)
+        tolerance *= 1.5
+    return np.ones(len(points), dtype=bool)
+
+
+def _near(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolArray:
+    return np.asarray(residual**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
+
+
+def _rigid_residuals(
+    points: Observations, variance: FloatArray, tolerance: float
+) -> Iterator[FloatArray]:
+    """(N,) residuals of the best shift of the header, then of the best affine."""
+    move = points.target - points.source
+    near = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1)) <= tolerance
+    middle = move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
+    yield np.hypot(*(move - middle).T)
+    found = consensus_affine(points.source, points.target, variance, tolerance, kind="affine")
+    if np.isfinite(found.matrix).all():
+        yield radial_residuals(found.matrix, points.source, points.target)
 
 
 def _concatenate(parts: list[Refined]) -> Refined:

@@ -13,12 +13,13 @@ from geodelreg.match.refine import Patches, cut_patches
 from geodelreg.match.surface import Surface, sample
 from geodelreg.pipeline.dense import Tuning, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
-from geodelreg.types import Band, FloatArray
+from geodelreg.types import Band, FloatArray, IntArray
 
 _DISPLACED_RADII = (4.0, 9.0)
 _DIRECTIONS = 8
 _BY_CHANCE = 0.25
 _TESTED_PATCHES = 160
+_LEAST_SEEN = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +44,7 @@ class AreaEvidence:
 
 
 def area_evidence(
-    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int
+    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int, few: bool
 ) -> AreaEvidence:
     """Compare correlation in place with that at displaced places, patch by patch.
 
@@ -53,60 +54,71 @@ def area_evidence(
         As for `geodelreg.pipeline.dense.match_pass`.
     size : int
         Side of a patch, template pixels.
+    few : bool
+        Test a sample of the patches instead of all.
     """
     angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
-    every = max(len(tiles) * 16 // _TESTED_PATCHES, 1)
+    every = max(len(tiles) * 16 // _TESTED_PATCHES, 1) if few else 1
     tested = best = 0
     for number, tile in enumerate(tiles):
-        template, surface = tile_images(part, tile, tuning)
-        patches = cut_patches(template, part.template.grid, size)
-        for index in range(number % every, len(patches), every):
-            scores = _correlations(part, matrix, surface, patches, index, offsets)
-            if scores is not None:
-                tested += 1
-                best += int(np.argmax(scores) == 0)
+        bands, surface = tile_images(part, tile, tuning)
+        patches = cut_patches(bands, part.template.grid, size)
+        chosen = np.arange(number % every, len(patches), every)
+        scores = _explained(part, matrix, surface, patches, chosen, offsets)
+        tested += len(scores)
+        best += int((scores.argmax(axis=1) == 0).sum()) if len(scores) else 0
     return AreaEvidence(tested, best)
 
 
-def _correlations(
+def _explained(
     part: Roles,
     matrix: FloatArray,
     surface: Surface,
     patches: Patches,
-    index: int,
+    chosen: IntArray,
     offsets: FloatArray,
-) -> FloatArray | None:
-    """|correlation| of one patch at each offset; None where it has no texture or no surface."""
+) -> FloatArray:
+    """(P, K) share of the surface's variance that the bands explain, per patch and offset.
+
+    Patches without texture or outside the surface are left out.
+    """
     size = patches.size
-    axis = (np.arange(0, size, 2) + HALF_PIXEL - size / 2.0)
+    picked = np.arange(0, size, 2)
+    axis = picked + HALF_PIXEL - size / 2.0
     grid_x, grid_y = np.meshgrid(axis, axis)
     inside = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
-    picked = np.arange(0, size, 2)
     take = (picked[:, None] * size + picked[None, :]).ravel()
-    values, valid = patches.values[index, take], patches.valid[index, take]
-    xy = patches.centre[index] + (offsets[:, None, :] + inside[None]) * patches.step
+    spots = (offsets[:, None, :] + inside[None]).reshape(-1, 2) * patches.step
+    xy = patches.centre[chosen][:, None, :] + spots[None]
     there, usable = sample(surface, part.to_surface(matrix, xy))
-    good = valid & usable.all(axis=0)
-    if good.sum() < 0.6 * len(take) or values[good].std() == 0:
-        return None
-    one = values[good] - values[good].mean()
-    other = there[:, good] - there[:, good].mean(axis=1, keepdims=True)
-    power = np.sqrt((other**2).sum(axis=1) * (one**2).sum())
-    return np.asarray(np.abs(other @ one) / np.maximum(power, 1e-12), dtype=np.float64)
+    there = there.reshape(len(chosen), len(offsets), -1).astype(np.float64)
+    seen = usable.reshape(there.shape).all(axis=1) & patches.valid[chosen][:, take]
+    good = seen.mean(axis=1) > _LEAST_SEEN
+    weight = seen[good][:, None, :].astype(np.float64)
+    bands = _centred(patches.values[chosen[good]][:, :, take].astype(np.float64), weight)
+    image = _centred(there[good], weight)
+    basis, _ = np.linalg.qr(bands.transpose(0, 2, 1))
+    explained = (np.matmul(image, basis) ** 2).sum(axis=2)
+    energy = np.maximum((image**2).sum(axis=2), 1e-12)
+    textured = (np.abs(bands).sum(axis=(1, 2)) > 0) & (energy.min(axis=1) > 1e-9)
+    return np.asarray((explained / energy)[textured])
 
 
-def overlay(
-    part: Roles, template: Band, surface: Surface, matrix: FloatArray
-) -> Overlay:
+def _centred(values: FloatArray, weight: FloatArray) -> FloatArray:
+    mean = (values * weight).sum(axis=2, keepdims=True) / weight.sum(axis=2, keepdims=True)
+    return np.asarray((values - mean) * weight)
+
+
+def overlay(part: Roles, template: Band, surface: Surface, matrix: FloatArray) -> Overlay:
     """Resample a surface onto a (decimated) template window under a correction `matrix`."""
     height, width = template.data.shape
     to_full = ~part.template.grid.transform @ template.grid.transform
     columns, rows = np.meshgrid(np.arange(width) + HALF_PIXEL, np.arange(height) + HALF_PIXEL)
     x, y = to_full @ (columns, rows)
     values, usable = sample(surface, part.to_surface(matrix, np.stack([x, y], axis=-1)))
-    return Overlay(template.data, values, usable & template.valid)
+    return Overlay(template.data, values, template.valid, usable)
 
 
 def grey_rmse(overlaid: Overlay, ms_is_template: bool) -> float:

@@ -127,7 +127,7 @@ def area_hypothesis(pair: Pair, images: WorkingPair) -> Hypothesis:
     template, finer = (ms, images.reference) if part.ms_is_template() else (images.reference, ms)
     surface = make_surface(finer, part.surface.grid, (0.5, 0.5))
     view = overlay(part, template, surface, IDENTITY)
-    shift = best_shift(view, template.valid, view.usable)
+    shift = best_shift(view)
     step = ~part.template.grid.transform @ template.grid.transform
     moved = np.array([[0.0, 0.0]]) + shift * np.array([step.a, step.e])
     matrix = IDENTITY.copy()

@@ -101,7 +101,9 @@ def scopes(pair: Pair) -> Iterator[Scope]:
     windows = overlap_windows(
         pair.source.grid, pair.reference.grid, pair.options.search_radius_px, map_points
     )
-    whole = tuple(Window(0, 0, r.grid.shape[1], r.grid.shape[0]) for r in (pair.source, pair.reference))
+    whole = tuple(
+        Window(0, 0, r.grid.shape[1], r.grid.shape[0]) for r in (pair.source, pair.reference)
+    )
     if windows is not None:
         yield Scope(*windows, FIRST_BUDGET_PX, "header overlap")
         if _decimated(pair, Scope(*windows, FIRST_BUDGET_PX, "")):

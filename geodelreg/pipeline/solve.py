@@ -45,6 +45,13 @@ _PASSES = 3
 _COARSE_SIGMA = 0.35
 _COARSE_FROM = 1.5
 _NEGLIGIBLE_PX = 0.005
+_PLAIN = (0.0, False)
+_HAZE = (1.0, False)
+_SHARPER = ((1.5, True), (1.0, True))
+_CLEARLY = 0.8
+_MOVE_PX = 0.1
+_SURE_LOG_CHANCE = -12.0
+_SHARPER_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,11 +163,9 @@ def _patch_counts(refined: Refinement, points: TiePoints) -> dict[str, int]:
 
 def _agreement_log_nfa(pair: Pair, points: TiePoints) -> float:
     """Chance agreement of patches, each of which may end anywhere within its reach."""
-    tested = points.status != Status.TEXTURE
-    gap = np.hypot(*points.residual_px[tested].T)
+    matched = points.kept | np.isin(points.status, (Status.CONSENSUS, Status.STAR, Status.RESIDUAL))
+    gap = np.hypot(*points.residual_px[matched].T)
     reach = 2 * RefineOptions().max_move * max(pair.pan_px_per_source_px, 1.0)
-    lost = ~points.kept[tested]
-    gap[lost] = np.maximum(gap[lost], reach)
     return log_nfa(gap, reach**2, 3, reach / 2)[0]
 
 
@@ -179,23 +184,77 @@ def refine_densely(
         tiles = [_without_bright(part, tile, hypothesis) for tile in tiles]
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
+    if not tiles:
+        return None
+    refined = _passes(part, tiles, hypothesis, matrix, RefineOptions(size=size))
+    timings["refine"] = perf_counter() - start
+    return refined
+
+
+def _passes(
+    part: Roles, tiles: list[Tile], hypothesis: Hypothesis, matrix: FloatArray,
+    options: RefineOptions,
+) -> Refinement | None:  # fmt: skip
+    threads = thread_count(part.pair)
+    haze = _HAZE if hypothesis.bright is not None else _PLAIN
     sigma, dense, tuning = DEFAULT_SIGMA, None, None
     for number in range(_PASSES):
-        if not tiles:
-            return None
         tone = fit_tone(part, tiles, matrix, sigma)
-        if tone is None:
-            return None
-        tuning = Tuning(sigma, tone)
+        tuning = Tuning(sigma, tone, *haze)
         if number:
-            tuning = replace(tuning, sigma=fit_sigma(part, tiles, matrix, tuning))
-            sigma = tuning.sigma
-        dense = match_pass(part, tiles, matrix, tuning, RefineOptions(size=size), threads)
+            sigma = fit_sigma(part, tiles, matrix, tuning)
+            tuning = replace(tuning, sigma=sigma)
+        dense = match_pass(part, tiles, matrix, tuning, options, threads)
         if dense.estimate is None:
-            return None
+            break
         matrix = dense.estimate.transformation.matrix
-    timings["refine"] = perf_counter() - start
-    return Refinement(tiles, tuning, dense, matrix, size) if dense and tuning else None
+    if dense is None or tuning is None:
+        return None
+    best = Refinement(tiles, tuning, dense, matrix, options.size)
+    others = _SHARPER if hypothesis.bright is None else (_PLAIN,)
+    best = _sharpest(part, best, others, options, threads)
+    return best if best.dense.estimate is not None else None
+
+
+def _sharpest(
+    part: Roles,
+    plain: Refinement,
+    others: tuple[tuple[float, bool], ...],
+    options: RefineOptions,
+    threads: int,
+) -> Refinement:
+    """Try looking at edges alone, with each patch's own tone: better where light or land changed."""
+    best, changed, wary = plain, False, bool(plain.tuning.high_pass)
+    for high_pass, local_tone in others:
+        local = local_tone and part.ms_is_template()
+        tuning = replace(plain.tuning, high_pass=high_pass, local_tone=local)
+        dense = match_pass(part, plain.tiles, best.matrix, tuning, options, threads)
+        clearly = 1.0 if changed else _CLEARLY
+        if not _is_sharper(part, dense, best.dense, clearly, _MOVE_PX if wary else math.inf):
+            break
+        assert dense.estimate is not None
+        matrix = dense.estimate.transformation.matrix
+        best, changed = replace(best, tuning=tuning, dense=dense, matrix=matrix), True
+    if not changed:
+        return plain
+    dense = match_pass(part, best.tiles, best.matrix, best.tuning, options, threads)
+    if dense.estimate is None:
+        return best
+    return replace(best, dense=dense, matrix=dense.estimate.transformation.matrix)
+
+
+def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float, move_px: float) -> bool:
+    """True when a pass is more certain, by a factor, than another without losing many patches."""
+    if one.estimate is None or other.estimate is None:
+        return one.estimate is not None
+    where = lattice(part.pair)
+    kept = [int((dense.status == Status.KEPT).sum()) for dense in (one, other)]
+    sigma = [float(e.sigma_at(where).mean()) for e in (one.estimate, other.estimate)]
+    if kept[0] < _SHARPER_SHARE * kept[1] or sigma[0] >= factor * sigma[1]:
+        return False
+    # more certain of another place is no gain where clouds are about: they are not the ground
+    gap = one.estimate.transformation(where) - other.estimate.transformation(where)
+    return bool(np.hypot(*gap.T).max() < move_px)
 
 
 def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:
@@ -209,8 +268,6 @@ def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:
     if hypothesis.bright is not None:
         tile = _without_bright(part, tile, hypothesis)
     tone = fit_tone(part, [tile], hypothesis.matrix, _COARSE_SIGMA)
-    if tone is None:
-        return hypothesis.matrix
     tuning = Tuning(_COARSE_SIGMA, tone)
     dense = match_pass(part, [tile], hypothesis.matrix, tuning, RefineOptions(), 1)
     return dense.estimate.transformation.matrix if dense.estimate else hypothesis.matrix
@@ -252,7 +309,9 @@ def conclude(
     matrix = estimate.transformation.matrix
     before, after = _overlays(part, hypothesis, refined.tuning, matrix)
     accuracy = measure(part, fitted, before, after)
-    area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size)
+    area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
+    if area.log_chance > _SURE_LOG_CHANCE:
+        area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=False)
     evidence = _evidence(pair, fitted, accuracy, area.log_chance, rival_correlation(after))
     grid = lattice(pair)
     move = pair.to_reference(matrix, grid) - pair.to_reference(IDENTITY, grid)

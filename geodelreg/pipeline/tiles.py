@@ -14,8 +14,8 @@ from geodelreg.types import Band, BoolArray, FloatArray, Grid, Window, WindowRea
 
 PATCH_PX = 20
 _TILE_PATCHES = 4
-SMALLEST_PATCH_PX = 10
-_WANTED_PATCHES = 150
+SMALLEST_PATCH_PX = 12
+_WANTED_PATCHES = 40
 _MOST_TILES_PER_AXIS = 8
 _LOW_PASS_REACH = 4.0
 _SLACK_PX = 3.0
@@ -176,9 +176,7 @@ def hide(band: Band, mask: BoolArray, mask_grid: Grid) -> Band:
     return replace(band, valid=band.valid & ~mask[np.ix_(rows, columns)])
 
 
-def read_tiles(
-    part: Roles, windows: list[Window], matrix: FloatArray, threads: int
-) -> list[Tile]:
+def read_tiles(part: Roles, windows: list[Window], matrix: FloatArray, threads: int) -> list[Tile]:
     """Read planned tiles, in order; those that lie outside the surface raster are left out."""
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         tiles = pool.map(lambda window: read_tile(part, window, matrix), windows)
