@@ -211,4 +211,4 @@ def _fields(shape: tuple[int, int], cover: float, rng: np.random.Generator) -> F
         size = (float(rng.uniform(60, 200)), float(rng.uniform(60, 200)))
         corners = cv2.boxPoints((centre, size, float(rng.uniform(0, 90))))
         cv2.fillConvexPoly(mask, corners.astype(np.int32), 1)
-    return cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.8)
+    return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.8), np.float32)

@@ -16,6 +16,8 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from benchmarks.truth import apply
+
 FloatArray = NDArray[np.float64]
 LOW_PASS_MS_PX = 0.45
 SMOOTH_MS_PX = 0.5
@@ -170,9 +172,9 @@ class _Sampler:
 
         height, width = ms.valid.shape
         rows, columns = np.mgrid[:height, :width] + 0.5
-        x, y = ms.transform @ (columns, rows)
+        x, y = apply(ms.transform, columns, rows)
         x, y = _change_crs(x, y, ms.crs_wkt, pan.crs_wkt)
-        self.position = np.stack(~pan.transform @ (x, y)) - 0.5
+        self.position = np.stack(apply(~pan.transform, x, y)) - 0.5
         middle = height // 2, width // 2
         step = self.position[:, middle[0], middle[1] + 1] - self.position[:, middle[0], middle[1]]
         self.ratio = float(np.hypot(*step))
@@ -282,7 +284,12 @@ def _refine(search: _Search, pan: _Sampler, options: MeasureOptions) -> Offsets:
         window = slice(top, top + search.size), slice(left, left + search.size)
         patch, valid = search.band[window], search.valid[window]
 
-        def score(offset: FloatArray, window=window, patch=patch, valid=valid) -> float:
+        def score(
+            offset: FloatArray,
+            window: tuple[slice, slice] = window,
+            patch: FloatArray = patch,
+            valid: NDArray[np.bool_] = valid,
+        ) -> float:
             values, weight = pan.sample(window, offset)
             return correlation(patch, values, weight * valid)
 
@@ -311,9 +318,9 @@ def _climb(score: Callable[[FloatArray], float], centre: FloatArray, step: float
     _, bi, bj, cii, cij, cjj = np.linalg.lstsq(design, values, rcond=None)[0]
     determinant = 4 * cii * cjj - cij**2
     if determinant <= 0 or cii >= 0:
-        return centre + ticks[int(np.argmax(values))] * step
+        return np.asarray(centre + ticks[int(np.argmax(values))] * step)
     peak = np.array([cij * bj - 2 * cjj * bi, cij * bi - 2 * cii * bj]) / determinant
-    return centre + np.clip(peak, -1.5, 1.5) * step
+    return np.asarray(centre + np.clip(peak, -1.5, 1.5) * step)
 
 
 def correlation(a: FloatArray, b: FloatArray, weight: FloatArray) -> float:

@@ -141,8 +141,7 @@ def align_pair(pair: Pair, data: Path) -> Row:
 def table(rows: list[Row]) -> str:
     """Markdown."""
     lines = [
-        "| pair | verdict | model | before dx, dy | after dx, dy | median window before → after "
-        "| windows | s |",
+        "| pair | verdict | model | before | after | median window before → after | windows | s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     lines += [

@@ -18,7 +18,7 @@ from benchmarks import ground as ground_module
 from benchmarks.ground import Ground, cut_ground
 from benchmarks.imagery import Imagery, ImageryNotFoundError, aerial, sentinel2
 from benchmarks.simulate import Placement, affine_placement, digitise, render, tone
-from benchmarks.truth import Truth
+from benchmarks.truth import Truth, apply
 
 log = logging.getLogger(__name__)
 PAN_WEIGHTS = (0.12, 0.34, 0.36, 0.18)
@@ -227,7 +227,8 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
     back = Transformer.from_crs(ms_crs, pan_crs, always_xy=True)
 
     def to_pan(column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack(~pan @ back.transform(*(true @ (column, row))), axis=-1)
+        x, y = back.transform(*apply(true, column, row))
+        return np.stack(apply(~pan, x, y), axis=-1)
 
     rows, columns = np.mgrid[:height, :width] + 0.5
     step = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]) * 8 + (
@@ -242,7 +243,7 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
 def _margin(placement: Placement, pan_shape: tuple[int, int]) -> int:
     """How far MS reaches beyond PAN, in PAN pixels, plus a little."""
     x, y = placement.centres_px[..., 0], placement.centres_px[..., 1]
-    beyond = max(-x.min(), -y.min(), x.max() - pan_shape[1], y.max() - pan_shape[0], 0.0)
+    beyond: float = max(-x.min(), -y.min(), x.max() - pan_shape[1], y.max() - pan_shape[0], 0.0)
     return math.ceil(beyond) + 16
 
 
@@ -262,7 +263,8 @@ def _variants(
 
 
 def _expose_pan(ground: Ground, rng: np.random.Generator) -> NDArray[np.uint16]:
-    radiance = np.tensordot(np.float32(PAN_WEIGHTS), ground.bands[:, *ground.pan_window], axes=1)
+    weights = np.array(PAN_WEIGHTS)
+    radiance = np.tensordot(weights, ground.bands[:, *ground.pan_window].astype(float), axes=1)
     return digitise(tone(radiance, PAN_GAMMA), rng)
 
 

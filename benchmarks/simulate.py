@@ -10,15 +10,19 @@ No low-order resampler takes part.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from benchmarks.truth import apply
+
 FloatArray = NDArray[np.float64]
 PSF_REACH_MS_PX = 4.0
+TAPER_PX = 32
 OVERSAMPLE_BELOW_RATIO = 2.5
-SPLINE_ORDER = 5
+SPLINE_ORDER: Literal[5] = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class Placement:
 def affine_placement(ms_to_field: Affine, shape: tuple[int, int]) -> Placement:
     """Placement of an MS raster of `shape` by an affine from its pixels to the field's."""
     row, column = np.mgrid[: shape[0], : shape[1]] + 0.5
-    x, y = ms_to_field @ (column, row)
+    x, y = apply(ms_to_field, column, row)
     linear = np.array([[ms_to_field.a, ms_to_field.b], [ms_to_field.d, ms_to_field.e]])
     return Placement(np.stack([x, y], axis=-1), linear)
 
@@ -82,12 +86,9 @@ def render(field: NDArray[np.floating], placement: Placement, blur_ms_px: float)
     from scipy import fft, ndimage
 
     ratio = float(np.sqrt(abs(np.linalg.det(placement.linear))))
-    pad = int(np.ceil(PSF_REACH_MS_PX * ratio)) + 16
-    padded = np.pad(np.asarray(field), pad, mode="symmetric")
-    size = tuple(fft.next_fast_len(n + n % 2, real=True) for n in padded.shape)
-    size = tuple(n + n % 2 for n in size)
-    extra = [(0, n - m) for n, m in zip(size, padded.shape, strict=True)]
-    padded = np.pad(padded, extra, mode="symmetric")
+    pad = int(np.ceil(PSF_REACH_MS_PX * ratio)) + TAPER_PX
+    padded = _periodic(field, pad)
+    size = padded.shape
     spectrum = fft.rfft2(padded, workers=2)
     fy, fx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None, :]
     for rows in np.array_split(np.arange(size[0]), max(1, size[0] // 512)):
@@ -97,15 +98,31 @@ def render(field: NDArray[np.floating], placement: Placement, blur_ms_px: float)
     factor = 2 if ratio < OVERSAMPLE_BELOW_RATIO else 1
     smooth = _inverse(spectrum, size, factor)
     index = (placement.centres_px - 0.5 + pad) * factor
-    return np.asarray(
-        ndimage.map_coordinates(
-            smooth,
-            [index[..., 1], index[..., 0]],
-            order=SPLINE_ORDER,
-            mode="mirror",
-            output=np.float64,
-        )
+    sampled = ndimage.map_coordinates(
+        smooth, np.stack([index[..., 1], index[..., 0]]), order=SPLINE_ORDER, mode="mirror"
     )
+    return np.asarray(sampled, dtype=np.float64)
+
+
+def _periodic(field: NDArray[np.floating], pad: int) -> NDArray[np.floating]:
+    """The field mirrored by `pad` pixels, or more, then fading to its mean: no jump at the seam."""
+    from scipy import fft
+
+    widths = []
+    for n in field.shape:
+        length = fft.next_fast_len(n + 2 * pad)
+        while length % 2:
+            length = fft.next_fast_len(length + 1)
+        widths.append((pad, length - n - pad))
+    mean = field.dtype.type(field.mean())
+    padded = np.pad(field, widths, mode="symmetric") - mean
+    ramp = (np.arange(TAPER_PX) + 0.5) / TAPER_PX
+    fade = (0.5 - 0.5 * np.cos(np.pi * ramp)).astype(field.dtype)
+    padded[:TAPER_PX] *= fade[:, None]
+    padded[-TAPER_PX:] *= fade[::-1, None]
+    padded[:, :TAPER_PX] *= fade
+    padded[:, -TAPER_PX:] *= fade[::-1]
+    return np.asarray(padded + mean)
 
 
 def _inverse(

@@ -70,14 +70,20 @@ def check_points(shape: tuple[int, int], per_side: int = CHECK_POINTS_PER_SIDE) 
     return np.stack([column.ravel(), row.ravel()], axis=1)
 
 
+def apply(transform: Affine, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Transform arrays of coordinates."""
+    a, b, c, d, e, f = tuple(transform)[:6]
+    return a * x + b * y + c, d * x + e * y + f
+
+
 def _to_pan_px(transform: Affine, xy: FloatArray, truth: Truth) -> FloatArray:
     from pyproj import CRS, Transformer
 
-    x, y = transform @ (xy[:, 0], xy[:, 1])
+    x, y = apply(transform, xy[:, 0], xy[:, 1])
     ms_crs, pan_crs = CRS.from_wkt(truth.ms_crs), CRS.from_wkt(truth.pan_crs)
     if ms_crs != pan_crs:
         x, y = Transformer.from_crs(ms_crs, pan_crs, always_xy=True).transform(x, y)
-    return np.stack(~Affine(*truth.pan) @ (x, y), axis=1)
+    return np.stack(apply(~Affine(*truth.pan), x, y), axis=1)
 
 
 def grid_rmse(corrected: Affine, truth: Truth) -> dict[str, float]:
