@@ -8,7 +8,9 @@ import sys
 
 COMMANDS = {
     "scenes": ("benchmarks.scenes", "write the scenes with known truth"),
+    "sweep": ("benchmarks.sweep", "align many scenes: rotation, shift, scale, GSD ratio"),
     "real": ("benchmarks.real_pairs", "align real pairs and measure them independently"),
+    "filters": ("benchmarks.filters", "mismatch filters against known truth"),
 }
 
 

@@ -112,7 +112,8 @@ def measure_pair(pair: Pair, data: Path, corrected: Affine | None = None) -> Off
 
 def align_pair(pair: Pair, data: Path) -> Row:
     """Measure, align with defaults, measure again."""
-    from geodelreg import AlignOptions, GeodelregError, align
+    from geodelreg import AlignOptions, align
+    from geodelreg.errors import GeodelregError
 
     before = measure_pair(pair, data)
     started = time.perf_counter()
