@@ -62,7 +62,7 @@ def align(
         if options.band:
             check_band(ms, options.band)
         check_band(pan, options.pan_band)
-        prints = {str(path): fingerprint(path) for path in (*_paths(source), reference)}
+        prints = {path: fingerprint(path) for path in (*_paths(source), str(reference))}
         opened = perf_counter() - start
         pair, solution = register(ms, pan, options, progress)
         alignment = _alignment(source, reference, pair, solution)
@@ -184,8 +184,8 @@ def revert(path: AnyPath) -> None:
 def export_gcps(
     alignment: Alignment,
     path: AnyPath,
-    format: str | None = None,
-    overwrite: bool = False,  # noqa: A002
+    format: str | None = None,  # noqa: A002 - the field's word
+    overwrite: bool = False,
 ) -> None:
     """Write the kept tie points as ground control points of the MS raster.
 

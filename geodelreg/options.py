@@ -1,4 +1,4 @@
-"""Frozen, validated options.  Each knob is documented here once; the command line reads it from here.
+"""Frozen, validated options; each knob is documented here once, for the command line too.
 
 This module imports nothing heavy: ``geodelreg --help`` loads it.
 """
@@ -62,13 +62,13 @@ class AlignOptions:
     pan_band: int = _knob(1, "Band of the PAN (reference) raster to match on, from 1.")
     search_radius_px: float = _knob(
         512.0,
-        "How far off, in PAN pixels, the header may be for the first search; when that finds nothing, "
-        "both rasters are searched whole.",
+        "How far off, in PAN pixels, the header may be for the first search; when that finds "
+        "nothing, both rasters are searched whole.",
     )
     tolerance_px: float = _knob(
         0.02,
-        "A correction that moves no pixel by more than this many PAN pixels, or by no more than its own uncertainty, "
-        "is not applied: verdict already_aligned.",
+        "A correction that moves no pixel by more than this many PAN pixels and is not significant "
+        "is not applied: the header stays, the verdict is already_aligned.",
     )
     ratio: float = _knob(0.8, "Lowe's limit on nearest over second nearest descriptor distance.")
     max_keypoints: int = _knob(
@@ -115,8 +115,8 @@ class WriteOptions:
     )
     georef: str = _knob(
         "geotransform",
-        "geotransform: OUT carries the corrected geotransform; gcps: OUT carries the ground control "
-        "points instead (a GeoTIFF holds one or the other).",
+        "geotransform: OUT carries the corrected geotransform; gcps: OUT carries the ground "
+        "control points instead (a GeoTIFF holds one or the other).",
         GEOREFS,
     )
     strip_rpc: bool = _knob(

@@ -197,7 +197,7 @@ class TiePoints:
     @property
     def kept(self) -> BoolArray:
         """(M,) bool, True where no stage rejected the point."""
-        return self.status == Status.KEPT
+        return np.asarray(self.status == Status.KEPT)
 
     @property
     def sigma_px(self) -> FloatArray:
@@ -227,16 +227,18 @@ class Correction:
     @property
     def map_transform(self) -> Affine:
         """Header map coordinates to true map coordinates."""
-        return self.corrected @ ~self.original
+        transform: Affine = self.corrected @ ~self.original
+        return transform
 
     def apply(self, transform: Affine) -> Affine:
         """Corrected geotransform of another raster that shares the header error."""
-        return self.map_transform @ transform
+        corrected: Affine = self.map_transform @ transform
+        return corrected
 
 
 @dataclass(frozen=True, slots=True)
 class Gcp:
-    """A ground control point: MS pixel (outer-corner convention) ↔ map coordinates in the MS CRS."""
+    """A ground control point: MS pixel (outer corner) ↔ map coordinates in the MS CRS."""
 
     id: str
     column: float
@@ -292,7 +294,7 @@ class Accuracy:
     before_rmse_px, before_rmse_m : float
         Of the kept tie points under the original header.
     sigma_centre_px, sigma_corner_px : float
-        Standard error of the correction (radial) at the centre and the worst corner of the MS raster.
+        Standard error of the correction (radial) at the MS raster's centre and worst corner.
     coverage : float
         Share of the overlap's area inside the hull of the kept points, 0 to 1.
     e1_before, e1_after : float
@@ -342,7 +344,7 @@ class Alignment:
         Bands matched on and their weights in the synthetic PAN.
     warnings : tuple of str
     crs_operation : str
-        pyproj's operation from PAN to MS map coordinates, with its accuracy; "" when the CRSs agree.
+        pyproj's operation from MS to PAN coordinates, with its accuracy; "" for equal CRSs.
     options : AlignOptions
     versions : dict of str to str
     timings_s : dict of str to float

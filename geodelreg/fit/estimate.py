@@ -1,4 +1,4 @@
-"""Weighted robust least squares: tie points with covariances to a transformation with covariance."""
+"""Weighted robust least squares: tie points with covariances to a transformation with its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fit.models import PARAMETER_COUNT, Frame, Transformation, design, transformation
-from geodelreg.types import BoolArray, FloatArray
+from geodelreg.types import BoolArray, FloatArray, IntArray
 
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _STUDENT_DOF = 6.0
@@ -33,8 +33,8 @@ class Observations:
     def __len__(self) -> int:
         return len(self.source)
 
-    def take(self, keep: BoolArray) -> Observations:
-        """The pairs where `keep` is True."""
+    def take(self, keep: BoolArray | IntArray) -> Observations:
+        """The pairs where `keep` is True, or with the indices in it."""
         return Observations(self.source[keep], self.target[keep], self.covariance[keep])
 
 
@@ -69,7 +69,7 @@ class Estimate:
         """(N,) standard error (radial, source pixels) of the transformation at (N, 2) pixels."""
         columns, _ = design(self.transformation.model, xy, self.frame)
         spread = np.einsum("nik,kl,nil->n", columns, self.covariance, columns)
-        return np.sqrt(np.maximum(spread, 0)) * self.frame.span_px
+        return np.asarray(np.sqrt(np.maximum(spread, 0)) * self.frame.span_px)
 
 
 def minimum_points(model: str) -> int:

@@ -1,7 +1,7 @@
-"""The acceptance gate: is the evidence enough to believe the correction?
+"""The acceptance gate: evidence against limits, and the verdict.
 
-Every reason is a measured value against a stated limit.  Evidence that needs pixels is measured in
-the pipeline and comes in as numbers; none of it is the fit's own residual.
+Every reason is a measured value against a stated limit.  Evidence that needs pixels is measured
+in the pipeline and comes in as numbers; none of it is the fit's own residual.
 """
 
 from __future__ import annotations

@@ -184,20 +184,3 @@ def linearise(mapping: PointMapping, at: FloatArray, step_px: float = 4.0) -> Fl
     out[:, :, 1] = (image[2] - image[3]) / (2 * step_px)
     out[:, :, 2] = image[4]
     return out
-
-
-def fitted_affine(mapping: PointMapping, shape: tuple[int, int]) -> FloatArray:
-    """(2, 3) affine closest to `mapping` over a raster of `shape` (height, width), least squares."""
-    rows, columns = np.meshgrid(
-        np.linspace(0, shape[0], 5), np.linspace(0, shape[1], 5), indexing="ij"
-    )
-    xy = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    image = mapping(xy)
-    good = np.isfinite(image).all(axis=1)
-    if good.sum() < 3:
-        raise CrsTransformError(
-            "the source raster's corners cannot be transformed into the reference's CRS",
-            "Check both CRS definitions and geotransforms.",
-        )
-    design = np.column_stack([xy[good], np.ones(int(good.sum()))])
-    return np.linalg.lstsq(design, image[good], rcond=None)[0].T

@@ -6,7 +6,7 @@ OpenCV and array indices put (0, 0) at that pixel's centre.
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,3 +29,8 @@ def centre_to_corner(xy: NDArray[_Floating]) -> NDArray[_Floating]:
 def corner_to_centre(xy: NDArray[_Floating]) -> NDArray[_Floating]:
     """Outer-corner coordinates (GDAL) to pixel-centre coordinates (OpenCV, array index)."""
     return xy - xy.dtype.type(HALF_PIXEL)
+
+
+def pixel_centres(index: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """Outer-corner coordinate of the centre of pixel number `index` along one axis."""
+    return np.asarray(index, dtype=np.float64) + HALF_PIXEL

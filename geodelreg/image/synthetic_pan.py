@@ -190,7 +190,7 @@ def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan
     left = target - weights @ stack
     terms = np.stack([np.ones(len(target)), *_products(bands, centre, spread, low, high)], axis=1)
     linear = (stack - centre[:, None]) / spread[:, None]
-    design = np.column_stack([terms, linear.T]) if _MAX_CURVED_BANDS >= len(bands) else terms[:, :1]
+    design = np.column_stack([terms, linear.T]) if len(bands) <= _MAX_CURVED_BANDS else terms[:, :1]
     train = np.arange(len(target)) % 2 == 0
     before = _robust_spread((left - np.median(left[train]))[~train])
     fitted = _tukey_fit(design[train], left[train])
@@ -213,10 +213,11 @@ def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least squares by Tukey's biweight from the median absolute residual, a little ridge."""
     ridge = np.eye(design.shape[1]) * 1e-6 * len(target)
     trust = np.clip(1 - (target / (_TUKEY_WIDE * _robust_spread(target) + 1e-30)) ** 2, 0, None)
-    fitted = np.zeros(design.shape[1])
+    fitted: FloatArray = np.zeros(design.shape[1])
     for _ in range(6):
         weighted = design * trust[:, None]
-        fitted = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ target)
+        normal = np.asarray(weighted.T @ design + ridge)
+        fitted = np.asarray(np.linalg.solve(normal, weighted.T @ target), dtype=np.float64)
         residual = target - design @ fitted
         scale = _robust_spread(residual)
         trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + 1e-30)) ** 2, 0, None) ** 2

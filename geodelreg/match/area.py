@@ -1,4 +1,4 @@
-"""Correlation of whole areas: where one image lies on the other, and whether it might lie elsewhere.
+"""Correlation of whole areas: where an image lies on another, and whether it might elsewhere.
 
 Masked normalised cross-correlation through the Fourier transform (Padfield 2012,
 doi:10.1109/TIP.2011.2181402).
@@ -91,7 +91,8 @@ def best_shift(overlay: Overlay) -> FloatArray:
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     height, width = one.shape
     moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
-    return moved * np.array([overlay.template.shape[1] / width, overlay.template.shape[0] / height])
+    rows, columns = overlay.template.shape
+    return np.asarray(moved * np.array([columns / width, rows / height]))
 
 
 def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -110,11 +111,11 @@ def _detail(
     """High-passed, standardised image, scaled down, with its mask."""
     weight = valid.astype(np.float32)
     level = float(image[valid].mean()) if valid.any() else 0.0
-    centred = (image - np.float32(level)) * weight
+    centred: Float32Array = ((image - np.float32(level)) * weight).astype(np.float32)
     if scale < 1.0:
         shape = (max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1))
-        centred = cv2.resize(centred, shape, interpolation=cv2.INTER_AREA)
-        weight = cv2.resize(weight, shape, interpolation=cv2.INTER_AREA)
+        centred = np.asarray(cv2.resize(centred, shape, interpolation=cv2.INTER_AREA), np.float32)
+        weight = np.asarray(cv2.resize(weight, shape, interpolation=cv2.INTER_AREA), np.float32)
     smooth = cv2.GaussianBlur(centred, (0, 0), _HIGH_PASS_SIGMA_PX)
     share = cv2.GaussianBlur(weight, (0, 0), _HIGH_PASS_SIGMA_PX)
     mask = (weight > 0.99).astype(np.float32)

@@ -31,6 +31,8 @@ from geodelreg.types import BoolArray, FloatArray, IntArray, Status
 
 _MEDIAN = 2 * np.log(2)  # of squared distances over variances, in the plane
 _SURE = 16.0
+_WORTHWHILE_GROWTH = 1.01
+_MAX_FLIPPED_SHARE = 0.5
 _MAX_ROUNDS = 20
 _ROBUST_FIT_ROUNDS = 12
 _MIN_POINTS = 4
@@ -168,7 +170,7 @@ def star_filter(
 def unfolded(source_xy: FloatArray, reference_xy: FloatArray) -> BoolArray:
     """Keep the points around which the mesh of the source does not fold over in the reference.
 
-    Points most of whose triangles flip go, worst first, until there are none.
+    Points most of whose triangles flip go, and the rest is triangulated anew, until none do.
 
     Parameters
     ----------
@@ -186,17 +188,17 @@ def unfolded(source_xy: FloatArray, reference_xy: FloatArray) -> BoolArray:
         corners = triangles.reshape(-1)
         around = np.maximum(np.bincount(corners, minlength=len(kept)), 1)
         share = np.bincount(corners, np.repeat(flipped, 3), len(kept)) / around
-        worst = _locally_worst(share, share > 0.5, triangles)
-        if not worst.any():
+        if not (share > _MAX_FLIPPED_SHARE).any():
             break
-        keep[kept[worst]] = False
+        keep[kept[share > _MAX_FLIPPED_SHARE]] = False
     return keep
 
 
 def _agreeing(field: Field, start: BoolArray, options: FilterOptions) -> BoolArray:
     """(M,) bool: drop what disagrees with its star, then take back what agrees with the rest.
 
-    Taking back goes on from near to far, each time followed by another look at the new mesh.
+    Taking back goes on from near to far as long as that is worth while, each time followed by
+    another look at the new mesh.
     """
     keep, spread = _pruned(field, start, options)
     for _ in range(_MAX_ROUNDS):
@@ -205,7 +207,7 @@ def _agreeing(field: Field, start: BoolArray, options: FilterOptions) -> BoolArr
         if (grown == before).all():
             break
         keep, spread = _pruned(field, grown, options)
-        if (keep <= before).all():
+        if keep.sum() <= _WORTHWHILE_GROWTH * before.sum():
             break
     return keep
 
@@ -263,11 +265,11 @@ def _misfit(field: Field, told: Prediction, spread: float) -> FloatArray:
 
 
 def _locally_worst(badness: FloatArray, bad: BoolArray, triangles: IntArray) -> BoolArray:
-    """True for the bad points that no bad neighbour on the mesh exceeds."""
+    """True for the bad points unless a neighbour on the mesh is twice as bad."""
     edge = edges(triangles)
     first, second = np.concatenate([edge, edge[:, ::-1]]).T
     worst = bad.copy()
-    exceeded = bad[first] & bad[second] & (badness[second] > badness[first])
+    exceeded = bad[first] & (badness[second] > 2 * badness[first])
     worst[first[exceeded]] = False
     return worst
 

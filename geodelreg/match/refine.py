@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.geo.crs import linearise
-from geodelreg.geo.pixel import HALF_PIXEL
+from geodelreg.geo.pixel import pixel_centres
 from geodelreg.match.surface import Surface, sample
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
 
@@ -152,7 +152,7 @@ def refine(
     patches : Patches
     surface : Surface
     mapping : callable
-        Template raster pixels (..., 2) to surface raster pixels (..., 2): the current transformation.
+        The current transformation: template raster pixels (..., 2) to surface raster pixels.
     options : RefineOptions
 
     Returns
@@ -217,10 +217,12 @@ def _gauss_newton(
     image = values.reshape(-1, side, side)
     good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
     good = good & patches.valid[active]
-    weight = good.astype(np.float32)
-    along_x = (image[:, 1:-1, 2:] - image[:, 1:-1, :-2]).reshape(len(active), n * n) / 2
-    along_y = (image[:, 2:, 1:-1] - image[:, :-2, 1:-1]).reshape(len(active), n * n) / 2
-    columns = [image[:, 1:-1, 1:-1].reshape(len(active), n * n), along_x, along_y]
+    weight: Float32Array = good.astype(np.float32)
+    along_x: Float32Array = (image[:, 1:-1, 2:] - image[:, 1:-1, :-2]).reshape(-1, n * n)
+    along_y: Float32Array = (image[:, 2:, 1:-1] - image[:, :-2, 1:-1]).reshape(-1, n * n)
+    along_x, along_y = along_x * np.float32(0.5), along_y * np.float32(0.5)
+    inner = image[:, 1:-1, 1:-1].reshape(len(active), n * n)
+    columns = [inner, along_x, along_y]
     columns.extend(patches.values[active].transpose(1, 0, 2))
     total = np.maximum(weight.sum(axis=1, keepdims=True), 1)
     centred = [(c - (c * weight).sum(axis=1, keepdims=True) / total) * weight for c in columns]
@@ -298,12 +300,12 @@ def _step(
 
 
 def _finite(covariance: FloatArray) -> FloatArray:
-    good = np.isfinite(covariance).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     return np.where(good[:, None, None], covariance, np.eye(2) * 1e6)
 
 
 def _offsets(size: int) -> FloatArray:
     """((n + 2)², 2) positions of patch pixels, with a margin, from the centre, in patch pixels."""
-    axis = np.arange(size + 2 * _MARGIN) - _MARGIN + HALF_PIXEL - size / 2.0
+    axis = pixel_centres(np.arange(size + 2 * _MARGIN) - _MARGIN) - size / 2.0
     grid_x, grid_y = np.meshgrid(axis, axis)
     return np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)

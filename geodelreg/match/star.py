@@ -15,7 +15,7 @@ from geodelreg.geo.triangulation import distinct, neighbours
 from geodelreg.types import FloatArray, IntArray
 
 _FEW_POINTS = 12
-_FIT_ROUNDS = 3
+_FIT_ROUNDS = 2
 _CAUCHY_TUNING = 2.0
 _NEARNESS = 3.0
 _LOWER_QUARTILE = 0.5754

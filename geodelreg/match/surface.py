@@ -1,8 +1,8 @@
 """A low-passed image as a continuous surface: cubic B-splines, sampled at any position.
 
 `cv2.remap` with INTER_CUBIC does not reproduce a linear ramp (errors up to 0.048 px); cubic
-B-splines (Unser 1999, doi:10.1109/79.799930) do, and they need no more than four bilinear look-ups a
-sample (Sigg & Hadwiger 2005, GPU Gems 2, chapter 20).
+B-splines (Unser 1999, doi:10.1109/79.799930) do, and they need no more than four bilinear look-ups
+a sample (Sigg & Hadwiger 2005, GPU Gems 2, chapter 20).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def low_pass_taps(sigma_px: float, box_px: float = 0.0) -> FloatArray:
         centre = np.round(x).astype(int) + radius
         box = np.bincount(centre, weights=inside, minlength=2 * radius + 1)
         taps = np.convolve(taps, 0.5 * (box + box[::-1]))
-    return taps / taps.sum()
+    return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 
 def make_surface(

@@ -30,8 +30,8 @@ def warnings_of(pair: Pair, solution: Solution, hypothesis: Hypothesis) -> tuple
         notes.append("bright objects (clouds?) move differently from the ground and were left out")
     if solution.transformation.model in ("similarity", "affine"):
         notes.append(
-            "the correction rotates the raster: its geotransform is no longer north-up, which GDAL's "
-            "pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
+            "the correction rotates the raster: its geotransform is no longer north-up, which "
+            "GDAL's pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
         )
     local = local_distortion(pair, solution)
     if local > _LOCAL_RMS_PX:

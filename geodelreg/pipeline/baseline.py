@@ -15,17 +15,11 @@ from geodelreg.image.stretch import to_uint8
 from geodelreg.match.consensus import log_nfa
 from geodelreg.match.keypoints import KeypointOptions, detect
 from geodelreg.match.zhang2013 import ZhangOptions, match_sift, match_zhang2013
+from geodelreg.pipeline.refinement import Refinement, refine_densely
 from geodelreg.pipeline.search import Hypothesis, WorkingPair, mean_band
-from geodelreg.pipeline.solve import (
-    Fitted,
-    Refinement,
-    Solution,
-    conclude,
-    overlap_corners,
-    refine_densely,
-)
+from geodelreg.pipeline.solve import Fitted, Solution, conclude
 from geodelreg.pipeline.state import Pair
-from geodelreg.pipeline.tiles import roles
+from geodelreg.pipeline.tiles import overlap_corners, roles
 from geodelreg.types import FloatArray, TiePoints
 
 _SIFT_SCATTER_PX = 0.3
@@ -90,7 +84,7 @@ def least_squares(model: str, points: Observations, frame: Frame) -> Estimate:
     variance = float((residual**2).sum()) / spare
     everyone = np.ones(len(points), dtype=bool)
     distance2 = (residual**2).sum(axis=1) / max(variance, 1e-30)
-    spread = np.linalg.pinv(normal, hermitian=True) * variance
+    spread = np.asarray(np.linalg.pinv(normal, hermitian=True) * variance, dtype=np.float64)
     return Estimate(fitted, parameters, spread, frame, variance, everyone, distance2)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit
-from geodelreg.geo.pixel import HALF_PIXEL
+from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan, single_band
 from geodelreg.match.consensus import consensus_affine, radial_residuals
 from geodelreg.match.refine import Refined, RefineOptions, cut_patches, refine
@@ -128,7 +128,7 @@ def _lattice(
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     rows, columns = rows.ravel(), columns.ravel()
     to_full = ~part.template.grid.transform @ band.grid.transform
-    x, y = to_full @ (columns + HALF_PIXEL, rows + HALF_PIXEL)
+    x, y = to_full @ (pixel_centres(columns), pixel_centres(rows))
     return np.stack([x, y], axis=1), (rows, columns)
 
 
@@ -165,7 +165,7 @@ def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning
         return _SIGMA_CANDIDATES[best]
     left, middle, right = unlike[best - 1 : best + 2]
     bend = left - 2 * middle + right
-    offset = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    offset = (left - right) / (2 * bend) if bend > 0 else 0.0
     return _SIGMA_CANDIDATES[best] + offset * (_SIGMA_CANDIDATES[1] - _SIGMA_CANDIDATES[0])
 
 
@@ -227,7 +227,7 @@ def _agreement(
 
 
 def _rigid_core(points: Observations, unit: float) -> BoolArray:
-    """Points near the shift, or else the affine, that a fair share of them fits to within matching noise.
+    """Points near the shift, or else the affine, that a fair share fits to within the noise.
 
     The ground is rigid: its patches agree to within their noise.  Clouds at various heights do not,
     however many they are.  The tolerance starts at the noise and grows until enough points agree.
@@ -237,7 +237,7 @@ def _rigid_core(points: Observations, unit: float) -> BoolArray:
     while tolerance <= unit:
         residuals = list(_rigid_residuals(points, variance, tolerance))
         shares = [float((residual <= tolerance).mean()) for residual in residuals]
-        if shares[0] >= max(_SHIFT_SHARE, 0.5 * shares[-1]):
+        if shares[0] >= max(_SHIFT_SHARE, shares[-1] / 2):
             return _near(residuals[0], tolerance, variance)
         if shares[-1] >= _AFFINE_SHARE:
             return _near(residuals[-1], tolerance, variance)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fit.gate import log10_binomial_tail
-from geodelreg.geo.pixel import HALF_PIXEL
+from geodelreg.geo.pixel import pixel_centres
 from geodelreg.match.area import Overlay
 from geodelreg.match.refine import Patches, cut_patches
 from geodelreg.match.surface import Surface, sample
@@ -86,7 +86,7 @@ def _explained(
     """
     size = patches.size
     picked = np.arange(0, size, 2)
-    axis = picked + HALF_PIXEL - size / 2.0
+    axis = pixel_centres(picked) - size / 2.0
     grid_x, grid_y = np.meshgrid(axis, axis)
     inside = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
     take = (picked[:, None] * size + picked[None, :]).ravel()
@@ -115,7 +115,7 @@ def overlay(part: Roles, template: Band, surface: Surface, matrix: FloatArray) -
     """Resample a surface onto a (decimated) template window under a correction `matrix`."""
     height, width = template.data.shape
     to_full = ~part.template.grid.transform @ template.grid.transform
-    columns, rows = np.meshgrid(np.arange(width) + HALF_PIXEL, np.arange(height) + HALF_PIXEL)
+    columns, rows = np.meshgrid(*(pixel_centres(np.arange(side)) for side in (width, height)))
     x, y = to_full @ (columns, rows)
     values, usable = sample(surface, part.to_surface(matrix, np.stack([x, y], axis=-1)))
     return Overlay(template.data, values, template.valid, usable)

@@ -206,8 +206,7 @@ def _look_up(mask: BoolArray, xy: FloatArray) -> BoolArray:
 
 def _far_apart(pair: Pair, one: Hypothesis, other: Hypothesis) -> bool:
     """True when two hypotheses differ somewhere by more than matching noise."""
-    height, width = pair.source.grid.shape
-    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    corners = pair.corners()
     gap = apply_affine(affine_from_matrix(one.matrix), corners)
     gap -= apply_affine(affine_from_matrix(other.matrix), corners)
     working_px = _working_gsd_m(pair, one.pair.scope) / min(pair.source_gsd_m)

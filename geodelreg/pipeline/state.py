@@ -67,6 +67,17 @@ class Pair:
         skew = unit * np.array(self.source_gsd_m)
         return Frame((width / 2, height / 2), max(height, width) / 2, tuple(skew.ravel().tolist()))
 
+    def corners(self) -> FloatArray:
+        """(4, 2) corners of the MS raster, pixels."""
+        height, width = self.source.grid.shape
+        return np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+
+    def lattice(self) -> FloatArray:
+        """(25, 2) pixels spread over the MS raster, its corners included."""
+        height, width = self.source.grid.shape
+        columns, rows = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
+        return np.stack([columns.ravel(), rows.ravel()], axis=1)
+
     def to_reference(self, matrix: FloatArray, source_px: FloatArray) -> FloatArray:
         """(..., 2) MS pixels to PAN pixels through a correction `matrix` (2, 3) and the headers."""
         return self.mapping.forward(apply_affine(affine_from_matrix(matrix), source_px))

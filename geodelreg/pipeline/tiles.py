@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.geo.pixel import HALF_PIXEL
+from geodelreg.geo.pixel import pixel_centres
 from geodelreg.match.surface import SPLINE_REACH_PX
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import Band, BoolArray, FloatArray, Grid, Window, WindowReader
@@ -102,6 +102,17 @@ def overlap_in_template(part: Roles, matrix: FloatArray) -> Window | None:
     return _clip(points.min(axis=0), points.max(axis=0), part.template.grid)
 
 
+def overlap_corners(part: Roles, matrix: FloatArray) -> FloatArray:
+    """(4, 2) MS pixels at the corners of the overlap's bounding window."""
+    region = overlap_in_template(part, matrix)
+    if region is None:
+        return part.pair.corners()
+    x = np.array([region.column, region.column + region.width], dtype=np.float64)
+    y = np.array([region.row, region.row + region.height], dtype=np.float64)
+    corners = np.array([[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]])
+    return corners if part.ms_is_template() else part.to_surface(matrix, corners)
+
+
 def _clip(low: FloatArray, high: FloatArray, grid: Grid) -> Window | None:
     height, width = grid.shape
     x0, y0 = (int(v) for v in np.floor(np.clip(low, 0, (width, height))))
@@ -169,8 +180,8 @@ def hide(band: Band, mask: BoolArray, mask_grid: Grid) -> Band:
     """The band with the pixels under a (coarser) mask of the same raster made invalid."""
     to_mask = ~mask_grid.transform @ band.grid.transform
     height, width = band.data.shape
-    columns = np.floor(to_mask.a * (np.arange(width) + HALF_PIXEL) + to_mask.c).astype(np.intp)
-    rows = np.floor(to_mask.e * (np.arange(height) + HALF_PIXEL) + to_mask.f).astype(np.intp)
+    columns = np.floor(to_mask.a * pixel_centres(np.arange(width)) + to_mask.c).astype(np.intp)
+    rows = np.floor(to_mask.e * pixel_centres(np.arange(height)) + to_mask.f).astype(np.intp)
     columns = np.clip(columns, 0, mask.shape[1] - 1)
     rows = np.clip(rows, 0, mask.shape[0] - 1)
     return replace(band, valid=band.valid & ~mask[np.ix_(rows, columns)])

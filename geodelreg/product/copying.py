@@ -13,6 +13,8 @@ from geodelreg.product.atomic import write_fully
 
 _CHUNK = 1 << 23
 _NOT_BY_KERNEL = (errno.EXDEV, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBADF)
+_WHOSE_FAULT = (errno.EIO, errno.ESTALE)
+"""Errors of which only separate reads and writes tell whether source or target is bad."""
 
 
 def copy_range(source: BinaryIO, target: BinaryIO, start: int, place: int, length: int) -> None:
@@ -80,7 +82,7 @@ def _copy_extent(source: BinaryIO, target: BinaryIO, start: int, place: int, len
             try:
                 done = os.copy_file_range(source.fileno(), target.fileno(), size, start, place)
             except OSError as error:
-                if error.errno not in _NOT_BY_KERNEL:
+                if error.errno not in (*_NOT_BY_KERNEL, *_WHOSE_FAULT):
                     raise
                 by_kernel = False
                 continue

@@ -11,7 +11,9 @@ from typing import Any
 
 from affine import Affine
 
+from geodelreg.errors import RasterUnreadableError
 from geodelreg.product import geotags
+from geodelreg.product.environment import gdal_failures
 from geodelreg.product.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
 from geodelreg.types import Correction, Gcp
 
@@ -72,7 +74,12 @@ class Georeference:
 
     @classmethod
     def read(cls, path: Path) -> Georeference:
-        """Read it; GDAL's errors pass through."""
+        """Read it from a TIFF.
+
+        Raises
+        ------
+        RasterUnreadableError
+        """
         import rasterio
         from rasterio.env import get_gdal_config
         from rasterio.errors import NotGeoreferencedWarning
@@ -80,11 +87,16 @@ class Georeference:
         with rasterio.Env(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             ignores = str(get_gdal_config("GTIFF_POINT_GEO_IGNORE")).upper() in _TRUE
-            with rasterio.open(path, GEOREF_SOURCES="INTERNAL") as inside:
-                transform = inside.transform if _is_placed(inside) else None
-                crs = inside.crs
-            with rasterio.open(path) as whole:
-                return cls(transform, crs, whole.crs, ignores)
+            try:
+                with rasterio.open(path, GEOREF_SOURCES="INTERNAL") as inside:
+                    transform = inside.transform if _is_placed(inside) else None
+                    crs = inside.crs
+                with rasterio.open(path) as whole:
+                    return cls(transform, crs, whole.crs, ignores)
+            except gdal_failures() as error:
+                raise RasterUnreadableError(
+                    f"{path} cannot be read by GDAL: {error}", "Obtain the file again."
+                ) from error
 
 
 def corrected_entries(

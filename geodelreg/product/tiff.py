@@ -27,7 +27,9 @@ _TYPE_BYTES = {
 }
 _CODES = {SHORT: "H", LONG: "I", DOUBLE: "d", LONG8: "Q"}
 _MAX_ENTRIES = 65535
-_MAX_DIRECTORIES = 65535
+_MAX_DIRECTORY_BYTES = 2**30
+"""Of all directories of a file with their values; a broken file may announce any length."""
+
 CLASSIC_LIMIT = 2**32 - 1
 """Largest offset that a classic TIFF can hold."""
 
@@ -210,13 +212,18 @@ class TiffFile:
         """Read the whole chain: main image, overviews, masks, further pages."""
         chain: list[Directory] = []
         seen: set[int] = set()
-        offset = self.first_offset
+        offset, total = self.first_offset, 0
         while offset:
-            if offset in seen or len(seen) > _MAX_DIRECTORIES:
+            if offset in seen:
                 raise self.broken("its TIFF directories form a circle")
             seen.add(offset)
-            chain.append(self.directory(offset))
-            offset = chain[-1].next_offset
+            directory = self.directory(offset)
+            total += directory.byte_length(self.layout)
+            total += sum(entry.size for entry in directory.entries if self.is_outside(entry))
+            if total > _MAX_DIRECTORY_BYTES:
+                raise self.broken("its TIFF directories are impossibly long")
+            chain.append(directory)
+            offset = directory.next_offset
         return chain
 
     def is_outside(self, entry: Entry) -> bool:

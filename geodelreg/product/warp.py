@@ -291,12 +291,11 @@ def _copy_colormaps(view: Any, dataset: Any) -> None:
 
 
 def _copy_pixels(warped: Any, dataset: Any, validity: _Validity) -> None:
-    bands = list(dataset.indexes)
     for window in compare.windows_of(dataset):
-        dataset.write(warped.read(bands, window=window), window=window)
+        data = warped.read(window=window)
+        dataset.write(data[: dataset.count], window=window)
         if validity.is_mask:
-            alpha = warped.read(warped.count, window=window)
-            dataset.write_mask(alpha != 0, window=window)
+            dataset.write_mask(data[-1] != 0, window=window)
 
 
 def _copy_overviews(source: Path, out: Path, resampling: str) -> None:

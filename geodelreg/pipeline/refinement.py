@@ -1,0 +1,180 @@
+"""Passes of dense matching, each with better tone, point spread and transformation."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from geodelreg.match.refine import RefineOptions
+from geodelreg.pipeline.dense import (
+    DEFAULT_SIGMA,
+    Dense,
+    Tuning,
+    fit_sigma,
+    fit_tone,
+    match_pass,
+)
+from geodelreg.pipeline.search import Hypothesis, WorkingPair
+from geodelreg.pipeline.state import Pair
+from geodelreg.pipeline.tiles import (
+    Roles,
+    Tile,
+    hide,
+    overlap_in_template,
+    patch_size,
+    plan_tiles,
+    read_tiles,
+)
+from geodelreg.types import FloatArray, Status
+
+_PASSES = 3
+COARSE_SIGMA = 0.35
+_COARSE_FROM = 1.5
+_PLAIN = (0.0, False)
+_HAZE = (1.0, False)
+_SHARPER = ((1.5, True), (1.0, True))
+_CLEARLY = 0.8
+_MOVE_PX = 0.1
+_SHARPER_SHARE = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """Tiles, what is known of the sensors, and the last pass over all patches."""
+
+    tiles: list[Tile]
+    tuning: Tuning
+    dense: Dense
+    matrix: FloatArray
+    size: int
+
+
+def thread_count(pair: Pair) -> int:
+    """Threads to use."""
+    return pair.options.threads or os.cpu_count() or 1
+
+
+def refine_densely(
+    part: Roles, hypothesis: Hypothesis, timings: dict[str, float]
+) -> Refinement | None:
+    """Passes over well-spread tiles, each with better tone, point spread and transformation."""
+    start = perf_counter()
+    matrix = _coarse_refinement(part, hypothesis)
+    region = overlap_in_template(part, matrix)
+    if region is None:
+        return None
+    threads, size = thread_count(part.pair), patch_size(region)
+    tiles = read_tiles(part, plan_tiles(region), matrix, threads)
+    if hypothesis.bright is not None:
+        tiles = [_without_bright(part, tile, hypothesis) for tile in tiles]
+    timings["read tiles"] = perf_counter() - start
+    start = perf_counter()
+    if not tiles:
+        return None
+    refined = _passes(part, tiles, hypothesis, matrix, RefineOptions(size=size))
+    timings["refine"] = perf_counter() - start
+    return refined
+
+
+def _passes(
+    part: Roles, tiles: list[Tile], hypothesis: Hypothesis, matrix: FloatArray,
+    options: RefineOptions,
+) -> Refinement | None:  # fmt: skip
+    threads = thread_count(part.pair)
+    haze = _HAZE if hypothesis.bright is not None else _PLAIN
+    sigma, dense, tuning = DEFAULT_SIGMA, None, None
+    for number in range(_PASSES):
+        tone = fit_tone(part, tiles, matrix, sigma)
+        tuning = Tuning(sigma, tone, *haze)
+        if number:
+            sigma = fit_sigma(part, tiles, matrix, tuning)
+            tuning = replace(tuning, sigma=sigma)
+        dense = match_pass(part, tiles, matrix, tuning, options, threads)
+        if dense.estimate is None:
+            break
+        matrix = dense.estimate.transformation.matrix
+    if dense is None or tuning is None:
+        return None
+    best = Refinement(tiles, tuning, dense, matrix, options.size)
+    others = _SHARPER if hypothesis.bright is None else (_PLAIN,)
+    best = _sharpest(part, best, others, options, threads)
+    return best if best.dense.estimate is not None else None
+
+
+def _sharpest(
+    part: Roles,
+    plain: Refinement,
+    others: tuple[tuple[float, bool], ...],
+    options: RefineOptions,
+    threads: int,
+) -> Refinement:
+    """Try edges alone, with each patch's own tone: better where light or land changed."""
+    best, changed, wary = plain, False, bool(plain.tuning.high_pass)
+    for high_pass, local_tone in others:
+        local = local_tone and part.ms_is_template()
+        tuning = replace(plain.tuning, high_pass=high_pass, local_tone=local)
+        dense = match_pass(part, plain.tiles, best.matrix, tuning, options, threads)
+        clearly = 1.0 if changed else _CLEARLY
+        if not _is_sharper(part, dense, best.dense, clearly, _MOVE_PX if wary else math.inf):
+            break
+        assert dense.estimate is not None
+        matrix = dense.estimate.transformation.matrix
+        best, changed = replace(best, tuning=tuning, dense=dense, matrix=matrix), True
+    if not changed:
+        return plain
+    dense = match_pass(part, best.tiles, best.matrix, best.tuning, options, threads)
+    if dense.estimate is None:
+        return best
+    return replace(best, dense=dense, matrix=dense.estimate.transformation.matrix)
+
+
+def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float, move_px: float) -> bool:
+    """True when a pass is more certain, by a factor, than another without losing many patches."""
+    if one.estimate is None or other.estimate is None:
+        return one.estimate is not None
+    where = part.pair.lattice()
+    kept = [int((dense.status == Status.KEPT).sum()) for dense in (one, other)]
+    sigma = [float(e.sigma_at(where).mean()) for e in (one.estimate, other.estimate)]
+    if kept[0] < _SHARPER_SHARE * kept[1] or sigma[0] >= factor * sigma[1]:
+        return False
+    # more certain of another place is no gain where clouds are about: they are not the ground
+    gap = one.estimate.transformation(where) - other.estimate.transformation(where)
+    return bool(np.hypot(*gap.T).max() < move_px)
+
+
+def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:
+    """One pass over the decimated pair, where that is much coarser than the template."""
+    images = hypothesis.pair
+    template = images.source[0] if part.ms_is_template() else images.reference
+    step = ~part.template.grid.transform @ template.grid.transform
+    if abs(step.a) < _COARSE_FROM:
+        return hypothesis.matrix
+    tile = working_tile(part, images)
+    if hypothesis.bright is not None:
+        tile = _without_bright(part, tile, hypothesis)
+    tone = fit_tone(part, [tile], hypothesis.matrix, COARSE_SIGMA)
+    tuning = Tuning(COARSE_SIGMA, tone)
+    dense = match_pass(part, [tile], hypothesis.matrix, tuning, RefineOptions(), 1)
+    return dense.estimate.transformation.matrix if dense.estimate else hypothesis.matrix
+
+
+def working_tile(part: Roles, images: WorkingPair) -> Tile:
+    """The decimated pair as one tile."""
+    if part.ms_is_template():
+        return Tile(images.source, [images.reference])
+    return Tile([images.reference], images.source)
+
+
+def _without_bright(part: Roles, tile: Tile, hypothesis: Hypothesis) -> Tile:
+    assert hypothesis.bright is not None
+    source = hypothesis.bright[0], hypothesis.pair.source[0].grid
+    reference = hypothesis.bright[1], hypothesis.pair.reference.grid
+    template, surface = (source, reference) if part.ms_is_template() else (reference, source)
+    return Tile(
+        [hide(band, *template) for band in tile.template],
+        [hide(band, *surface) for band in tile.surface],
+    )
