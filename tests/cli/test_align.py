@@ -128,11 +128,13 @@ def test_an_aligned_raster_keeps_its_header(
     assert transform_of(tmp_path / "twice.tif") == transform_of(folder / "out.tif")
 
 
-def test_dry_run_writes_no_file(geodelreg: Command, pair: Path) -> None:
+def test_dry_run_writes_no_file_and_verbose_names_the_steps(geodelreg: Command, pair: Path) -> None:
     before = snapshot(pair)
-    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", cwd=pair)
+    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "-v", cwd=pair)
     assert done.returncode == 0
     assert "check points" in done.stderr
+    assert "geodelreg: refining\n" in done.stderr
+    assert "DEBUG" not in done.stderr
     assert done.stdout == ""
     assert snapshot(pair) == before
 
@@ -288,10 +290,3 @@ def test_the_papers_method_prints_its_point_counts(geodelreg: Command, pair: Pat
     assert len(counts) >= 5
     assert counts[2:] == sorted(counts[2:], reverse=True)
     assert min(counts) >= 3
-
-
-def test_verbose_names_the_steps(geodelreg: Command, pair: Path) -> None:
-    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "-v", cwd=pair)
-    assert done.returncode == 0
-    assert "geodelreg: refining\n" in done.stderr
-    assert "DEBUG" not in done.stderr

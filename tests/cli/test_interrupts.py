@@ -72,7 +72,7 @@ def test_a_signal_in_mid_work_removes_temporaries(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.3, 0.6, 0.9, 1.2, 1.5])
+@pytest.mark.parametrize("delay_s", [0.0, 0.5, 1.0, 1.5])
 def test_align_is_terminated_or_done_never_between(pair: Path, delay_s: float) -> None:
     before = snapshot(pair)
     process = subprocess.Popen(
