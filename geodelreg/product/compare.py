@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, RasterUnreadableError
 from geodelreg.geo.affine import affine_matrix
-from geodelreg.product.geotags import DOMAIN
 from geodelreg.product.header import Provenance
+from geodelreg.product.metadata import attribute, colormap, lost_metadata
 
 _WINDOW_BYTES = 16_000_000
 _ATTRIBUTES = {
@@ -30,8 +30,6 @@ _ENCODING = {
     "compression": "compression",
     "photometric": "photometric interpretation",
 }
-GDAL_DOMAINS = {"DERIVED_SUBDATASETS", "SUBDATASETS", "IMAGE_STRUCTURE", "LocationInfo", "RPC"}
-"""Metadata domains that GDAL fills itself."""
 
 
 def check_placement(
@@ -101,7 +99,7 @@ def metadata_differences(
         found = [
             text
             for name, text in names.items()
-            if not _same(getattr(before, name), getattr(after, name))
+            if not _same(attribute(before, name), attribute(after, name))
         ]
         bands = before.indexes
         if any(before.overviews(b) != after.overviews(b) for b in bands):
@@ -116,29 +114,6 @@ def metadata_differences(
         for domain, items in domains.items():
             found.append(f"metadata {domain}{where} ({', '.join(sorted(items)[:5])})")
     return found
-
-
-def lost_metadata(
-    source: Path, out: Path, ignored: Collection[str] = ()
-) -> list[dict[str, dict[str, str]]]:
-    """Metadata items of the source that the output lacks or says differently.
-
-    Parameters
-    ----------
-    source, out : Path
-    ignored : collection of str
-        Domains that do not count.
-
-    Returns
-    -------
-    list of dict
-        Items by domain ("" the default one): of the raster first, then of each band.
-    """
-    import rasterio
-
-    with rasterio.open(source) as before, rasterio.open(out) as after:
-        levels = (0, *(band for band in before.indexes if band <= after.count))
-        return [_lost_items(before, after, level, ignored) for level in levels]
 
 
 def check_pixels(source: Path, out: Path, target: Path, overviews: bool) -> None:
@@ -185,14 +160,6 @@ def check_decodable(source: Path) -> None:
 def numpy_type(name: str) -> str:
     """Name of the numpy type that rasterio reads a band of type `name` into."""
     return {"complex_int16": "complex64"}.get(name, name)
-
-
-def colormap(dataset: Any, band: int) -> Any:
-    """Colour table of a band, None without one."""
-    try:
-        return dataset.colormap(band)
-    except ValueError:
-        return None
 
 
 def windows_of(dataset: Any) -> Iterator[Any]:
@@ -261,20 +228,3 @@ def _same(a: Any, b: Any) -> bool:
     if not isinstance(a, tuple | list):
         return bool(a == b or (a != a and b != b))
     return len(a) == len(b) and all(_same(p, q) for p, q in zip(a, b, strict=True))
-
-
-def _lost_items(
-    before: Any, after: Any, band: int, ignored: Collection[str]
-) -> dict[str, dict[str, str]]:
-    ignored = {*GDAL_DOMAINS, DOMAIN} - {"RPC"} | set(ignored)
-    lost = {}
-    for domain in sorted({"", *before.tag_namespaces(band)} - ignored):
-        new = after.tags(band, ns=domain or None)
-        items = {
-            key: value
-            for key, value in before.tags(band, ns=domain or None).items()
-            if not key.startswith(DOMAIN + "_") and new.get(key, "").strip() != value.strip()
-        }
-        if items:
-            lost[domain] = items
-    return lost

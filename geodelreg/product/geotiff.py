@@ -12,7 +12,7 @@ from pathlib import Path
 
 from geodelreg.errors import RasterUnreadableError, UsageError
 from geodelreg.options import WriteOptions
-from geodelreg.product import compare, sidecars
+from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.atomic import check_not_input, staged
 from geodelreg.product.copying import open_source
 from geodelreg.product.environment import gdal_failures, gdal_session
@@ -118,7 +118,7 @@ def _losses(source: Path, out: Path, content: Provenance, copied: bool) -> list[
     lost = compare.metadata_differences(source, out, copied, content.strip_rpc)
     notes = [f"{source.name}: not kept in the output: {what}" for what in lost]
     with rasterio.open(out) as dataset:
-        has_rpc = "RPC" in dataset.tag_namespaces()
+        has_rpc = "RPC" in metadata.domains(dataset)
     if has_rpc:
         notes.append(
             f"{source.name}: the output keeps RPCs, which do not know the correction; "

@@ -11,16 +11,16 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
-from typing import Any, BinaryIO
-from xml.sax.saxutils import escape
+from typing import BinaryIO
 
 from geodelreg.errors import (
     OutputUnwritableError,
     RasterNotFoundError,
     UnsafeInPlaceError,
 )
-from geodelreg.product import compare, relayout, sidecars, undo
+from geodelreg.product import compare, metadata, relayout, sidecars, undo
 from geodelreg.product.atomic import exclusive, unwritable
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
@@ -230,5 +230,4 @@ def _has_rpc(raster: Path) -> bool:
     import rasterio
 
     with rasterio.open(raster) as dataset:
-        namespaces: Any = dataset.tag_namespaces()
-    return "RPC" in namespaces
+        return "RPC" in metadata.domains(dataset)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.options import WriteOptions
-from geodelreg.product import compare, sidecars
+from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.header import Provenance, merged_domains
 from geodelreg.product.tiff import is_tiff
@@ -86,7 +86,7 @@ def rewrite(
     if driver in _TIFF_DRIVERS:
         creation = _tiff_creation(source, driver, options, notes)
         _create_copy(source, str(source), out, target, driver, creation)
-        edit_private(out, content, compare.lost_metadata(source, out, _NOT_CARRIED))
+        edit_private(out, content, metadata.lost_metadata(source, out, _NOT_CARRIED))
         _clean_pam(out, content)
     else:
         with corrected_view(source, content) as (name, xml):
@@ -146,7 +146,7 @@ def _tiff_creation(
     user = user_creation(options)
     creation = {"BIGTIFF": "IF_SAFER"}
     with rasterio.open(source) as dataset:
-        structure = dataset.tags(ns="IMAGE_STRUCTURE")
+        structure = metadata.tags(dataset, 0, "IMAGE_STRUCTURE")
         has_overviews = bool(dataset.overviews(1))
         inherited = dataset.driver in _TIFF_DRIVERS and is_tiff(source)
         blocks = dataset.block_shapes[0]
@@ -208,9 +208,9 @@ def _complete_metadata(source: Path, out: Path, content: Provenance) -> None:
         unsaid = {
             domain: items
             for domain, items in content.domains.items()
-            if not items.items() <= dataset.tags(ns=domain or None).items()
+            if not items.items() <= metadata.tags(dataset, 0, domain).items()
         }
-    missing = merged_domains(compare.lost_metadata(source, out, _NOT_CARRIED)[0], unsaid)
+    missing = merged_domains(metadata.lost_metadata(source, out, _NOT_CARRIED)[0], unsaid)
     if missing:
         path = sidecars.pam_path(out)
         pam = path.read_bytes() if path.is_file() else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +11,10 @@ from xml.etree import ElementTree
 
 from affine import Affine
 
-from geodelreg.product import compare, sidecars
+from geodelreg.product import metadata, sidecars
 from geodelreg.product.header import Provenance
+
+_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
 
 
 @contextmanager
@@ -33,7 +36,7 @@ def corrected_view(
 
     with MemoryFile(ext=".vrt") as plain, rasterio.open(source) as dataset:
         rasterio.shutil.copy(dataset, plain.name, driver="VRT")
-        root = ElementTree.fromstring(plain.read())
+        root = ElementTree.fromstring(_text(plain.read()))
         sidecars.add_metadata(root, _further_domains(dataset, 0))
         for element, band in zip(root.iter("VRTRasterBand"), dataset.indexes, strict=False):
             sidecars.add_metadata(element, _further_domains(dataset, band))
@@ -50,6 +53,15 @@ def corrected_view(
         yield corrected.name, text
 
 
+def _text(xml: bytes) -> str:
+    """XML that GDAL has written; it passes texts of old products on as they are."""
+    try:
+        text = xml.decode()
+    except UnicodeDecodeError:
+        text = xml.decode("latin-1")
+    return _CONTROL.sub("", text)
+
+
 def _set_exactly(band: ElementTree.Element, tag: str, value: float) -> None:
     """Give a number all its digits, of which GDAL writes 16."""
     element = band.find(tag)
@@ -59,10 +71,9 @@ def _set_exactly(band: ElementTree.Element, tag: str, value: float) -> None:
 
 def _further_domains(dataset: Any, band: int) -> dict[str, dict[str, str]]:
     """Metadata of the domains that GDAL does not carry over; those of GDAL itself apart."""
-    own = set(dataset.tag_namespaces(band)) - compare.GDAL_DOMAINS
-    return {
-        domain: dataset.tags(band, ns=domain) for domain in own if not domain.startswith("xml:")
-    }
+    own = metadata.domains(dataset, band) - metadata.GDAL_DOMAINS - {""}
+    plain = (domain for domain in own if not domain.startswith("xml:"))
+    return {domain: metadata.tags(dataset, band, domain) for domain in plain}
 
 
 def _replace_placement(root: ElementTree.Element, content: Provenance) -> None:

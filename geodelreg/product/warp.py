@@ -15,7 +15,7 @@ from affine import Affine
 
 from geodelreg.geo.affine import apply_affine
 from geodelreg.options import WriteOptions
-from geodelreg.product import compare, sidecars
+from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.atomic import check_not_input, staged
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
@@ -31,7 +31,7 @@ _BLOCK_PX = 256
 _SNAP_PX = 1e-6
 _EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
-_NOT_CARRIED = compare.GDAL_DOMAINS | {"GEOLOCATION"}
+_NOT_CARRIED = metadata.GDAL_DOMAINS | {"GEOLOCATION"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,20 +272,20 @@ def _annotate(view: Any, dataset: Any) -> None:
     if view.dtypes[0] in ("uint8", "uint16"):
         _copy_colormaps(view, dataset)
     dataset.colorinterp = view.colorinterp
-    dataset.descriptions = view.descriptions
+    dataset.descriptions = metadata.attribute(view, "descriptions") or (None,) * view.count
     dataset.scales, dataset.offsets = view.scales, view.offsets
-    dataset.units = [unit or "" for unit in view.units]
+    dataset.units = [unit or "" for unit in metadata.attribute(view, "units") or [""] * view.count]
     for band in (0, *view.indexes):
-        domains = {"", *view.tag_namespaces(band)} - _NOT_CARRIED
+        domains = metadata.domains(view, band) - _NOT_CARRIED
         for domain in sorted(name for name in domains if not name.startswith("xml:")):
-            items = view.tags(band, ns=domain or None)
+            items = metadata.tags(view, band, domain)
             kept = {k: v for k, v in items.items() if not k.startswith("STATISTICS_")}
             dataset.update_tags(band, ns=domain or None, **kept)
 
 
 def _copy_colormaps(view: Any, dataset: Any) -> None:
     for band in view.indexes:
-        colormap = compare.colormap(view, band)
+        colormap = metadata.colormap(view, band)
         if colormap is not None:
             dataset.write_colormap(band, colormap)
 

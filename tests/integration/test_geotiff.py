@@ -185,6 +185,28 @@ def test_georef_gcps_without_gcps_is_wrong_usage(tmp_path: Path) -> None:
     assert not (tmp_path / "o.tif").exists()
 
 
+def test_metadata_in_latin_1_survives(tmp_path: Path) -> None:
+    source = tmp_path / "ms.tif"
+    text = "capteur à défilement".encode("latin-1")
+    data = np.arange(600, dtype=np.uint8).reshape(20, 30)
+    item = b'<GDALMetadata>\n<Item name="NOTE">' + text + b"</Item>\n</GDALMetadata>"
+    with tifffile.TiffWriter(source) as tiff:
+        tiff.write(data, software=text, extratags=[(42112, 2, 0, item, True)])
+    pam = f"<PAMDataset><SRS>{UTM18}</SRS><GeoTransform>0,2,0,9,0,-2</GeoTransform></PAMDataset>"
+    (tmp_path / "ms.tif.aux.xml").write_text(pam)
+    with tifffile.TiffFile(write(source)) as tiff:
+        tags = tiff.pages[0].tags
+        assert tags["Software"].value.encode("latin-1") == text
+        file = tiff.filehandle
+        file.seek(tags[42112].valueoffset)
+        assert text in file.read(tags[42112].count)
+    for name in ("out.dat", "out.vrt"):
+        target = tmp_path / name
+        options = WriteOptions(driver="ENVI" if name == "out.dat" else None)
+        write_corrected(source, target, correction_of(source), GCPS, TAGS, options)
+        assert_same_pixels(source, target)
+
+
 FINITE = {"allow_nan": False, "allow_infinity": False}
 
 
