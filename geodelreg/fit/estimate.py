@@ -12,6 +12,7 @@ from geodelreg.types import BoolArray, FloatArray, IntArray
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _STUDENT_DOF = 6.0
 _REJECT_D2 = 25.0
+_SPREAD_ROUNDS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,16 +135,16 @@ def robust_fit(
     extra = extra_variance_px2 or 0.0
     student = np.ones(len(points))
     previous = None
-    for _ in range(30):
+    for number in range(20):
         inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
         parameters, normal = weighted_fit(model, points, inverse * student[:, None, None], frame)
         residual = transformation(model, parameters, frame).residuals(points.source, points.target)
-        if extra_variance_px2 is None:
+        if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = common_variance(residual, points.covariance)
             inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
         student = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
-        if previous is not None and np.abs(parameters - previous).max() < 1e-10:
+        if previous is not None and np.abs(parameters - previous).max() < 1e-9:
             break
         previous = parameters
     inlier = distance2 < _REJECT_D2
@@ -193,7 +194,7 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
     if median_at(0.0) <= _MEDIAN_CHI2_2:
         return 0.0
     low, high = 0.0, float(np.median((residual**2).sum(axis=1)) + 1e-12)
-    for _ in range(40):
+    for _ in range(24):
         middle = (low + high) / 2
         low, high = (middle, high) if median_at(middle) > _MEDIAN_CHI2_2 else (low, middle)
     return high

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from geodelreg.geo.crs import linearise
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.match.surface import Surface, sample
+from geodelreg.match.surface import Surface, sample_patches
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
 
 _MARGIN = 1
@@ -212,8 +212,7 @@ def _gauss_newton(
     n, side = patches.size, patches.size + 2 * _MARGIN
     linear = local[active, :, :2] * patches.step
     anchor = local[active, :, 2] + np.einsum("pij,pj->pi", linear, move[active])
-    position = np.einsum("pij,kj->pki", linear, offsets) + anchor[:, None, :]
-    values, usable = sample(surface, position)
+    values, usable = sample_patches(surface, anchor, linear, offsets)
     image = values.reshape(-1, side, side)
     good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
     good = good & patches.valid[active]

@@ -17,9 +17,11 @@ from geodelreg.geo.pixel import corner_to_centre
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid
 
 _POLE = np.sqrt(3.0) - 2.0
-_PREFILTER_RADIUS = 12
+_PREFILTER_RADIUS = 8
 SPLINE_REACH_PX = _PREFILTER_RADIUS + 4
 _VALID_SHARE = 0.999
+_GAUSSIAN_REACH = 3.5
+_NO_BLUR_PX = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,34 +56,23 @@ def _spline_prefilter() -> FloatArray:
     return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 
-def low_pass_taps(sigma_px: float, box_px: float = 0.0) -> FloatArray:
-    """1-D point spread: a Gaussian convolved with a box, sampled and normalised.
+def low_pass_taps(sigma_px: float) -> FloatArray:
+    """1-D Gaussian point spread, sampled and normalised.
 
     Parameters
     ----------
     sigma_px : float
-        Standard deviation of the Gaussian; 0 = none.
-    box_px : float
-        Width of the box (the detector); up to 1 = none.
+        Standard deviation; 0 = none.
 
     Returns
     -------
     (2 r + 1,) float64, sum 1
     """
-    fine = 8
-    taps = np.ones(1)
-    if sigma_px > 0.05:
-        radius = int(np.ceil(4.0 * sigma_px))
-        x = np.arange(-radius, radius + 1, dtype=np.float64)
-        taps = np.exp(-0.5 * (x / sigma_px) ** 2)
-    if box_px > 1.0:
-        half = box_px / 2.0
-        radius = int(np.ceil(half))
-        x = (np.arange(-radius * fine, radius * fine + 1)) / fine
-        inside = (np.abs(x) <= half).astype(np.float64)
-        centre = np.round(x).astype(int) + radius
-        box = np.bincount(centre, weights=inside, minlength=2 * radius + 1)
-        taps = np.convolve(taps, 0.5 * (box + box[::-1]))
+    if sigma_px <= _NO_BLUR_PX:
+        return np.ones(1)
+    radius = int(np.ceil(_GAUSSIAN_REACH * sigma_px))
+    x = np.arange(-radius, radius + 1, dtype=np.float64)
+    taps = np.exp(-(x**2) / (2 * sigma_px**2))
     return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 
@@ -106,7 +97,7 @@ def make_surface(
     if not usable.all():
         filled, usable = _fill(band, taps)
     prefilter = _spline_prefilter()
-    kernels = [np.convolve(t, prefilter) for t in taps]
+    kernels = [_symmetric(np.convolve(t, prefilter)) for t in taps]
     offset = np.float32(np.mean(filled)) if filled.size else np.float32(0)
     filled = filled - offset
     if high_pass_px > 0:
@@ -120,6 +111,11 @@ def make_surface(
         window_matrix(full, band.grid),
         float(offset),
     )
+
+
+def _symmetric(taps: FloatArray) -> FloatArray:
+    """Exactly symmetric taps, which OpenCV filters with half the work."""
+    return (taps + taps[::-1]) / 2
 
 
 def high_pass(band: Band, sigma_px: float) -> Band:
@@ -146,13 +142,13 @@ def _fill(band: Band, taps: list[FloatArray]) -> tuple[Float32Array, BoolArray]:
 
 
 def sample(surface: Surface, xy: FloatArray) -> tuple[Float32Array, BoolArray]:
-    """Values of the surface.
+    """Values of the surface anywhere.
 
     Parameters
     ----------
     surface : Surface
     xy : (P, K, 2) float64
-        Full-raster pixels, outer corner; K small.
+        Full-raster pixels, outer corner.
 
     Returns
     -------
@@ -162,44 +158,79 @@ def sample(surface: Surface, xy: FloatArray) -> tuple[Float32Array, BoolArray]:
         False outside the window and where the low-pass touched invalid pixels.
     """
     m = surface.to_window
-    position = np.empty(xy.shape, dtype=np.float64)
-    position[..., 0] = m[0, 0] * xy[..., 0] + m[0, 1] * xy[..., 1] + m[0, 2]
-    position[..., 1] = m[1, 0] * xy[..., 0] + m[1, 1] * xy[..., 1] + m[1, 2]
-    position = corner_to_centre(position)
+    x = m[0, 0] * xy[..., 0] + m[0, 1] * xy[..., 1] + m[0, 2]
+    y = m[1, 0] * xy[..., 0] + m[1, 1] * xy[..., 1] + m[1, 2]
+    return _look_up(surface, x.astype(np.float32), y.astype(np.float32))
+
+
+def sample_patches(
+    surface: Surface, anchor: FloatArray, linear: FloatArray, offsets: FloatArray
+) -> tuple[Float32Array, BoolArray]:
+    """Values on a small lattice around each of many anchors.
+
+    Parameters
+    ----------
+    surface : Surface
+    anchor : (P, 2) float64
+        Full-raster pixels, outer corner.
+    linear : (P, 2, 2) float64
+        Lattice steps to full-raster pixels, per anchor.
+    offsets : (K, 2) float64
+        The lattice.
+
+    Returns
+    -------
+    As `sample`, (P, K).
+    """
+    m = surface.to_window
+    origin = anchor @ m[:, :2].T + m[:, 2]
+    steps = np.matmul(m[:, :2], linear).astype(np.float32)
+    grid = offsets.T.astype(np.float32)
+    origin32 = origin.astype(np.float32)
+    x = steps[:, 0, :] @ grid + origin32[:, 0, None]
+    y = steps[:, 1, :] @ grid + origin32[:, 1, None]
+    return _look_up(surface, x, y)
+
+
+def _look_up(surface: Surface, x: Float32Array, y: Float32Array) -> tuple[Float32Array, BoolArray]:
+    """Values and usability at outer-corner positions of the window."""
     height, width = surface.coefficients.shape
-    finite = np.isfinite(position).all(axis=-1)
-    position[~finite] = -10.0
-    nearest = np.rint(position)
-    inside = finite & (nearest >= 1).all(axis=-1)
-    inside &= (nearest[..., 0] <= width - 2) & (nearest[..., 1] <= height - 2)
-    np.clip(nearest[..., 0], 0, width - 1, out=nearest[..., 0])
-    np.clip(nearest[..., 1], 0, height - 1, out=nearest[..., 1])
-    index = nearest.astype(np.int32)
-    inside &= surface.usable[index[..., 1], index[..., 0]]
-    return _evaluate(surface.coefficients, position), inside
+    x, y = corner_to_centre(x), corner_to_centre(y)
+    with np.errstate(invalid="ignore"):
+        inside = (x >= 1) & (x <= width - 2) & (y >= 1) & (y <= height - 2)
+    if not inside.all():
+        x, y = np.where(inside, x, np.float32(1)), np.where(inside, y, np.float32(1))
+    if not surface.usable.all():
+        inside &= surface.usable[np.rint(y).astype(np.intp), np.rint(x).astype(np.intp)]
+    return _evaluate(surface.coefficients, x, y), inside
 
 
-def _evaluate(coefficients: Float32Array, position: FloatArray) -> Float32Array:
-    base = np.floor(position)
-    f = (position - base).astype(np.float32)
-    base32 = base.astype(np.float32)
-    square, cube = f * f, f * f * f
-    w0 = (1 - 3 * f + 3 * square - cube) / 6
-    w1 = (4 - 6 * square + 3 * cube) / 6
-    w3 = cube / 6
-    low = w0 + w1
-    high = 1 - low
-    at_low = base32 + (w1 / low - 1)
-    at_high = base32 + (w3 / high + 1)
-    out = np.zeros(position.shape[:-1], dtype=np.float32)
-    for ax, wx in ((at_low, low), (at_high, high)):
-        for ay, wy in ((at_low, low), (at_high, high)):
-            value = cv2.remap(
-                coefficients,
-                np.ascontiguousarray(ax[..., 0]),
-                np.ascontiguousarray(ay[..., 1]),
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REPLICATE,
+def _evaluate(coefficients: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
+    x_low, x_high, x_share = _two_taps(x)
+    y_low, y_high, y_share = _two_taps(y)
+    rows = []
+    for at_y in (y_low, y_high):
+        left, right = (
+            np.asarray(
+                cv2.remap(
+                    coefficients, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                ),
+                dtype=np.float32,
             )
-            out += wx[..., 0] * wy[..., 1] * np.asarray(value, dtype=np.float32)
-    return out
+            for at_x in (x_low, x_high)
+        )
+        rows.append(right + x_share * (left - right))
+    return np.asarray(rows[1] + y_share * (rows[0] - rows[1]), dtype=np.float32)
+
+
+def _two_taps(at: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Positions of two linear look-ups that make up the cubic B-spline, and the first's weight."""
+    base = np.floor(at)
+    f = at - base
+    square = f * f
+    cube = square * f
+    w1 = (4 - 6 * square + 3 * cube) / np.float32(6)
+    w3 = cube / np.float32(6)
+    low = (1 - 3 * f + 3 * square - cube) / np.float32(6) + w1
+    high = 1 - low
+    return base - 1 + w1 / low, base + 1 + w3 / high, low

@@ -91,7 +91,7 @@ def least_squares(model: str, points: Observations, frame: Frame) -> Estimate:
 def _match(pair: Pair, images: WorkingPair) -> tuple[TiePoints, dict[str, int]]:
     """The paper's steps 1 to 6, or 1 and 2, in full-raster pixels."""
     band = images.source[0] if pair.options.band else mean_band(images.source[:3])
-    settings = KeypointOptions(max_keypoints=pair.options.max_keypoints)
+    settings = KeypointOptions(max_keypoints=pair.options.max_keypoints, root=False)
     source = detect(to_uint8(band), band.valid, settings)
     reference = detect(to_uint8(images.reference), images.reference.valid, settings)
     steps = match_zhang2013 if pair.options.method == "zhang2013" else match_sift

@@ -23,9 +23,9 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_SIGMA = 0.5
 _SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
-_TONE_SAMPLES = 20_000
+_TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
-_SIGMA_TILES = 6
+_SIGMA_PIXELS = 600_000
 _MIXED_SIGMA = 0.03
 _CORE_SIGMAS = 1.5
 _CORE_FLOOR_PX = 0.03
@@ -101,10 +101,7 @@ def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -
     bands, target = [], []
     for tile in tiles:
         xy, take = _lattice(tile.template[0], part, per_tile)
-        surfaces = [
-            make_surface(band, part.surface.grid, surface_sigma(part, tile, sigma))
-            for band in tile.surface
-        ]
+        surfaces = _surfaces(part, tile, sigma)
         place = part.to_surface(matrix, xy)[:, None]
         fine = [sample(surface, place) for surface in surfaces]
         good = np.logical_and.reduce([usable[:, 0] for _, usable in fine])
@@ -117,6 +114,13 @@ def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -
     stacked, goal = np.concatenate(bands, axis=1), np.concatenate(target)
     fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= _LEAST_SAMPLES else None
     return fitted or single_band(len(stacked), 0)
+
+
+def _surfaces(part: Roles, tile: Tile, sigma: float) -> list[Surface]:
+    low_pass, grid = surface_sigma(part, tile, sigma), part.surface.grid
+    if len(tile.surface) == 1:
+        return [tile.low_passed(grid, low_pass, 0.0)]
+    return [make_surface(band, grid, low_pass) for band in tile.surface]
 
 
 def _lattice(
@@ -134,27 +138,31 @@ def _lattice(
 
 def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Surface]:
     """The template band (or the bands, with local tone) and the surface of a tile."""
-    if not part.ms_is_template():
-        templates, finer = tile.template[:1], tuning.tone(tile.surface)
-    elif tuning.local_tone:
-        templates, finer = tile.template, tile.surface[0]
+    low_pass, wide = surface_sigma(part, tile, tuning.sigma), 0.0
+    if tuning.high_pass:
+        wide = float(np.mean(surface_sigma(part, tile, tuning.high_pass)))
+    if part.ms_is_template():
+        templates = tile.template if tuning.local_tone else [tuning.tone(tile.template)]
+        surface = tile.low_passed(part.surface.grid, low_pass, wide)
     else:
-        templates, finer = [tuning.tone(tile.template)], tile.surface[0]
-    sigma, wide = surface_sigma(part, tile, tuning.sigma), 0.0
+        templates = tile.template[:1]
+        finer = tuning.tone(tile.surface)
+        surface = make_surface(finer, part.surface.grid, low_pass, wide)
     if tuning.high_pass:
         templates = [high_pass(band, tuning.high_pass) for band in templates]
-        wide = float(np.mean(surface_sigma(part, tile, tuning.high_pass)))
-    return templates, make_surface(finer, part.surface.grid, sigma, wide)
+    return templates, surface
 
 
 def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning) -> float:
     """Low-pass with which the finer image resembles the coarser one most, in template pixels."""
-    chosen = tiles[:: max(len(tiles) // _SIGMA_TILES, 1)][:_SIGMA_TILES]
+    count = max(_SIGMA_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
+    chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
     unlike = []
     for sigma in _SIGMA_CANDIDATES:
         total = 0.0
         for tile in chosen:
-            (template,), surface = tile_images(part, tile, replace(tuning, sigma=sigma))
+            images = Tile(tile.template, tile.surface)
+            (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
             xy, take = _lattice(template, part, 4000)
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
             good = usable[:, 0] & template.valid[take]

@@ -90,7 +90,7 @@ def _passes(
     for number in range(_PASSES):
         tone = fit_tone(part, tiles, matrix, sigma)
         tuning = Tuning(sigma, tone, *haze)
-        if number:
+        if number == 1:
             sigma = fit_sigma(part, tiles, matrix, tuning)
             tuning = replace(tuning, sigma=sigma)
         dense = match_pass(part, tiles, matrix, tuning, options, threads)

@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 FIRST_BUDGET_PX = 400_000
 SECOND_BUDGET_PX = 1_600_000
+FIRST_KEYPOINTS = 1500
+SECOND_KEYPOINTS = 8000
 _THRESHOLD_PX = 1.0
 _CHANCE_LOG_NFA = -2.0
 _SURE_LOG_NFA = -12.0
@@ -45,12 +47,15 @@ class Scope:
     source, reference : Window
     budget_px : int
         Pixels of each decimated image at most.
+    keypoints : int
+        Keypoints of each image at most.
     name : str
     """
 
     source: Window
     reference: Window
     budget_px: int
+    keypoints: int
     name: str
 
 
@@ -105,11 +110,11 @@ def scopes(pair: Pair) -> Iterator[Scope]:
         Window(0, 0, r.grid.shape[1], r.grid.shape[0]) for r in (pair.source, pair.reference)
     )
     if windows is not None:
-        yield Scope(*windows, FIRST_BUDGET_PX, "header overlap")
-        if _decimated(pair, Scope(*windows, FIRST_BUDGET_PX, "")):
-            yield Scope(*windows, SECOND_BUDGET_PX, "header overlap, finer")
+        yield Scope(*windows, FIRST_BUDGET_PX, FIRST_KEYPOINTS, "header overlap")
+        if _decimated(pair, Scope(*windows, FIRST_BUDGET_PX, 0, "")):
+            yield Scope(*windows, SECOND_BUDGET_PX, SECOND_KEYPOINTS, "header overlap, finer")
     if windows != whole:
-        yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, "both rasters whole")
+        yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, SECOND_KEYPOINTS, "both rasters whole")
 
 
 def _decimated(pair: Pair, scope: Scope) -> bool:
@@ -156,12 +161,12 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     """
     found: list[Hypothesis] = []
     try:
-        reference = _detect(images.reference, False, pair)
+        reference = _detect(images.reference, False, pair, images.scope)
     except NoDataError:
         return
     for band in _views(images.source):
         try:
-            keypoints = _detect(band, _mirrored(pair), pair)
+            keypoints = _detect(band, _mirrored(pair), pair, images.scope)
         except NoDataError:
             continue
         agreed = _hypotheses_of(pair, images, band, keypoints, reference)
@@ -246,9 +251,9 @@ def _mirrored(pair: Pair) -> bool:
     return turns[0] * turns[1] < 0
 
 
-def _detect(band: Band, flip: bool, pair: Pair) -> Keypoints:
+def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
     image, valid = to_uint8(band), band.valid
-    options = KeypointOptions(max_keypoints=pair.options.max_keypoints, root=True)
+    options = KeypointOptions(max_keypoints=min(scope.keypoints, pair.options.max_keypoints))
     if not flip:
         return detect(image, valid, options)
     return detect(np.ascontiguousarray(image[::-1]), np.ascontiguousarray(valid[::-1]), options)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.match.surface import SPLINE_REACH_PX
+from geodelreg.match.surface import SPLINE_REACH_PX, Surface, make_surface
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import Band, BoolArray, FloatArray, Grid, Window, WindowReader
 
 PATCH_PX = 20
-_TILE_PATCHES = 4
+_SPREAD_TILE_PATCHES = 4
+_ADJOINING_TILE_PATCHES = 8
+_MEMO = 2
 SMALLEST_PATCH_PX = 12
 _WANTED_PATCHES = 40
 _MOST_TILES_PER_AXIS = 8
@@ -35,6 +37,16 @@ class Tile:
 
     template: list[Band]
     surface: list[Band]
+    _memo: dict[tuple[float, float, float], Surface] = field(default_factory=dict, repr=False)
+
+    def low_passed(self, full: Grid, sigma_px: tuple[float, float], high_pass_px: float) -> Surface:
+        """`make_surface` of the first surface band; the last few are remembered."""
+        key = (*sigma_px, high_pass_px)
+        if key not in self._memo:
+            while len(self._memo) >= _MEMO:
+                del self._memo[next(iter(self._memo))]
+            self._memo[key] = make_surface(self.surface[0], full, sigma_px, high_pass_px)
+        return self._memo[key]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,12 +154,11 @@ def plan_tiles(region: Window) -> list[Window]:
 
 def _spans(offset: int, length: int, size: int) -> list[tuple[int, int]]:
     """(start, length) of the tiles along one axis; adjoining ones hold whole patches."""
-    tile = size * _TILE_PATCHES
-    count = -(-length // tile)
-    if count > _MOST_TILES_PER_AXIS:
+    tile = size * _SPREAD_TILE_PATCHES
+    if length > _MOST_TILES_PER_AXIS * tile:
         gaps = np.linspace(0, length - tile, _MOST_TILES_PER_AXIS)
         return [(offset + round(float(gap)), tile) for gap in gaps]
-    usable = length // size * size
+    tile, usable = size * _ADJOINING_TILE_PATCHES, length // size * size
     first = offset + (length - usable) // 2
     return [(first + start, min(tile, usable - start)) for start in range(0, usable, tile)]
 
