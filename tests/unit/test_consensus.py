@@ -139,7 +139,7 @@ def test_positions_alone_find_8_inliers_among_200() -> None:
 @pytest.mark.parametrize("kind", ["similarity", "affine"])
 def test_random_matches_say_nothing(kind: str) -> None:
     alarms = 0
-    for seed in range(40):
+    for seed in range(20):
         source, reference, ratio = contaminated(similarity(1, 0, 0, 0), 0, 200, 100 + seed)
         keypoints = with_frames(source, reference, 0, 1, 0, seed)
         found = consensus_keypoints(*keypoints, one_each(ratio), 1.5, seed, kind)
@@ -147,7 +147,7 @@ def test_random_matches_say_nothing(kind: str) -> None:
         alarms += (
             log_nfa(radial_residuals(found.matrix, source, reference), SIZE_PX**2, size)[0] < 0
         )
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 def test_mirrored_scene_is_not_a_model() -> None:

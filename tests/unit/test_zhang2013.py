@@ -123,6 +123,7 @@ def test_few_points_pass_through_every_step(count: int) -> None:
     assert status.tolist() == [0] * count
 
 
+@pytest.fixture(scope="module")
 def scene_keypoints() -> tuple[Keypoints, Keypoints]:
     """Keypoints of a textured image and of its copy under TRUTH, with other noise."""
     rng = np.random.default_rng(9)
@@ -142,8 +143,8 @@ def scene_keypoints() -> tuple[Keypoints, Keypoints]:
     return keypoints[0], keypoints[1]
 
 
-def test_whole_method_on_images() -> None:
-    tie_points, counts = match_zhang2013(*scene_keypoints())
+def test_whole_method_on_images(scene_keypoints: tuple[Keypoints, Keypoints]) -> None:
+    tie_points, counts = match_zhang2013(*scene_keypoints)
     assert list(counts) == [
         "nearest", "ratio", "one_to_one", "not_collinear", "not_cocircular", "final_ratio",
         "corresponding",
@@ -168,16 +169,17 @@ def test_whole_method_on_images() -> None:
     assert np.isnan(tie_points.residual_px).all()
 
 
-def test_traditional_sift_is_the_ratio_test_alone() -> None:
-    keypoints = scene_keypoints()
-    tie_points, counts = match_sift(*keypoints)
-    _, zhang_counts = match_zhang2013(*keypoints)
+def test_traditional_sift_is_the_ratio_test_alone(
+    scene_keypoints: tuple[Keypoints, Keypoints],
+) -> None:
+    tie_points, counts = match_sift(*scene_keypoints)
+    _, zhang_counts = match_zhang2013(*scene_keypoints)
     assert list(counts) == ["nearest", "ratio"]
     assert counts["ratio"] == zhang_counts["ratio"] == tie_points.kept.sum()
     assert set(tie_points.status.tolist()) == {Status.KEPT, Status.RATIO}
 
 
-def test_each_step_can_be_switched_off() -> None:
+def test_each_step_can_be_switched_off(scene_keypoints: tuple[Keypoints, Keypoints]) -> None:
     off = ZhangOptions(min_altitude=0, min_incircle=0, final_ratio=1, min_shared_edges=0)
-    _, counts = match_zhang2013(*scene_keypoints(), off)
+    _, counts = match_zhang2013(*scene_keypoints, off)
     assert counts["one_to_one"] == counts["corresponding"]
