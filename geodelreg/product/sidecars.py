@@ -22,6 +22,9 @@ logger = logging.getLogger(__name__)
 PIXEL_SUFFIXES = (".ovr", ".msk", ".msk.ovr", ".ovr.msk")
 """Side files of pixels: valid beside any copy of the raster."""
 
+UNDO_SUFFIX = ".geodelreg-undo.json"
+"""Of the record of edits in place, which is about one file alone."""
+
 _PLACEMENT_ELEMENTS = ("SRS", "GeoTransform", "GCPList")
 _ESRI_DOMAIN = "xml:ESRI"
 _MAX_PAM_BYTES = 64_000_000
@@ -58,8 +61,8 @@ def world_files(raster: Path) -> list[Path]:
 
 
 def all_sidecars(raster: Path) -> list[Path]:
-    """Existing side files that GDAL would take for a part of `raster`."""
-    suffixed = [beside(raster, suffix) for suffix in (".aux.xml", *PIXEL_SUFFIXES)]
+    """Existing side files that GDAL, or `revert`, would take for a part of `raster`."""
+    suffixed = [beside(raster, s) for s in (".aux.xml", *PIXEL_SUFFIXES, UNDO_SUFFIX)]
     return [path for path in suffixed if os.path.lexists(path)] + world_files(raster)
 
 

@@ -105,7 +105,7 @@ class Edit:
 
 def record_path(raster: Path) -> Path:
     """Where the record of a raster lies."""
-    return sidecars.beside(raster, ".geodelreg-undo.json")
+    return sidecars.beside(raster, sidecars.UNDO_SUFFIX)
 
 
 def load(raster: Path) -> list[Edit]:

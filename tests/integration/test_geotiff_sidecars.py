@@ -110,6 +110,7 @@ def test_stale_files_beside_the_target_go_with_overwrite(tmp_path: Path) -> None
     source = make_tiff(tmp_path / "ms.tif", overviews="external")
     (tmp_path / "out.tif").write_bytes(b"something older")
     stale = {".tif.aux.xml": PLACED_PAM, ".tif.msk": "old", ".tif.ovr": "old"}
+    stale[".tif.geodelreg-undo.json"] = "of the older file"
     world = dict.fromkeys((".tfw", ".tifw", ".wld", ".TFW"), "9\n0\n0\n-9\n1\n1\n")
     for suffix, text in (stale | world).items():
         (tmp_path / f"out{suffix}").write_text(text)
