@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geodelreg.match.descriptors import matched_xy, select
 from geodelreg.types import BoolArray, FloatArray, IntArray, Keypoints, Matches
@@ -144,8 +143,7 @@ def consensus_keypoints(
     hypotheses = hypotheses[_plausible(hypotheses)]
     if len(hypotheses) == 0:
         return sampled
-    scores = _scores(hypotheses, pool_source, pool_reference, threshold_px)
-    best = _best_of(hypotheses, scores)
+    best = _best_of(hypotheses, _scores(hypotheses, pool_source, pool_reference, threshold_px))
     paired = _refined(best, source_xy, reference_xy, threshold_px, kind)
     return paired if paired.inliers.sum() >= sampled.inliers.sum() else sampled
 
@@ -311,8 +309,8 @@ def _agreeing_pairs(
         np.triu(np.abs(log_scale[:, None] - log_scale) < 2 * _LOG_SCALE_TOLERANCE, 1)
         & (np.cos(turn[:, None] - turn) > math.cos(2 * _TURN_TOLERANCE))
     )
-    source_step = _complex(source.xy[s[second]] - source.xy[s[first]])
-    reference_step = _complex(reference.xy[r[second]] - reference.xy[r[first]])
+    source_step = (source.xy[s[second]] - source.xy[s[first]]) @ [1, 1j]
+    reference_step = (reference.xy[r[second]] - reference.xy[r[first]]) @ [1, 1j]
     far = (np.abs(source_step) > _MIN_BASELINE_PX) & (np.abs(reference_step) > _MIN_BASELINE_PX)
     first, second = first[far], second[far]
     stretch = np.log(reference_step[far] / source_step[far])
@@ -323,10 +321,6 @@ def _agreeing_pairs(
     first, second = first[agree], second[agree]
     best = np.argsort(matches.ratio[first] + matches.ratio[second], kind="stable")[:_MAX_PAIRS]
     return first[best], second[best]
-
-
-def _complex(xy: FloatArray) -> NDArray[np.complex128]:
-    return np.asarray(xy[:, 0] + 1j * xy[:, 1])
 
 
 def _plausible(matrices: FloatArray) -> BoolArray:
