@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -48,6 +49,8 @@ def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     for name in ("geodelreg", "geodelreg_cli"):
         logging.getLogger(name).setLevel(logging.DEBUG if debug else level)
     logging.captureWarnings(True)
+    if not (debug or verbose):  # GDAL's own threads know no logger and would print
+        os.environ.setdefault("CPL_LOG", os.devnull)
 
 
 def log_steps(show: Progress | None) -> Progress:

@@ -8,6 +8,7 @@ imported when it is called.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -133,4 +134,5 @@ def main() -> None:
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of --json has gone: not worth a word
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback out of the interpreter's exit
     sys.exit(code)

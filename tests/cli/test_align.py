@@ -290,3 +290,18 @@ def test_the_papers_method_prints_its_point_counts(geodelreg: Command, pair: Pat
     assert len(counts) >= 5
     assert counts[2:] == sorted(counts[2:], reverse=True)
     assert min(counts) >= 3
+
+
+def test_a_lossy_output_is_refused_in_two_lines(geodelreg: Command, pair: Path) -> None:
+    before = snapshot(pair)
+    done = geodelreg(
+        *("align", "ms.tif", "pan.tif", "-o", "out.tif", "--co", "COMPRESS=JPEG", "--json"),
+        *("--gcps", "out.points", "--report", "out.json"),
+        cwd=pair,
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    cause, remedy = done.stderr.splitlines()
+    assert cause.startswith("geodelreg: error: out.tif")
+    assert "lossless" in remedy
+    assert snapshot(pair) == before

@@ -98,7 +98,7 @@ def test_align_is_terminated_or_done_never_between(pair: Path, delay_s: float) -
     after = snapshot(pair)
     assert {name: after[name] for name in before} == before
     assert "Traceback" not in stderr
-    if process.returncode == 143:
+    if process.returncode in (143, -signal.SIGTERM):  # the latter while the interpreter exits
         assert set(after) <= {*before, "out.tif"}
     else:
         assert process.returncode == 0
