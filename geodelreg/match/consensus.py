@@ -309,8 +309,8 @@ def _agreeing_pairs(
         np.triu(np.abs(log_scale[:, None] - log_scale) < 2 * _LOG_SCALE_TOLERANCE, 1)
         & (np.cos(turn[:, None] - turn) > math.cos(2 * _TURN_TOLERANCE))
     )
-    source_step = (source.xy[s[second]] - source.xy[s[first]]) @ [1, 1j]
-    reference_step = (reference.xy[r[second]] - reference.xy[r[first]]) @ [1, 1j]
+    source_step = (source.xy[s[second]] - source.xy[s[first]]).view(np.complex128)[:, 0]
+    reference_step = (reference.xy[r[second]] - reference.xy[r[first]]).view(np.complex128)[:, 0]
     far = (np.abs(source_step) > _MIN_BASELINE_PX) & (np.abs(reference_step) > _MIN_BASELINE_PX)
     first, second = first[far], second[far]
     stretch = np.log(reference_step[far] / source_step[far])
