@@ -71,7 +71,7 @@ def detect(
     """
     options = options or KeypointOptions()
     if min(image.shape) < 2:
-        return _no_keypoints()
+        return no_keypoints()
     # Without precise upscaling every position is off by (+0.25, +0.25) px.
     sift = cv2.SIFT.create(
         nOctaveLayers=OCTAVE_LAYERS,
@@ -80,7 +80,7 @@ def detect(
     )
     found = sift.detect(image, None)
     if not found:
-        return _no_keypoints()
+        return no_keypoints()
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], dtype=np.float64)
     candidates = np.flatnonzero(_away_from_invalid(table, valid, options.invalid_margin))
     chosen = candidates[_spread_order(table[candidates], image.shape, options)]
@@ -88,7 +88,8 @@ def detect(
     return _describe(sift, image, [found[i] for i in chosen], options.root)
 
 
-def _no_keypoints() -> Keypoints:
+def no_keypoints() -> Keypoints:
+    """Of an image without any."""
     empty = np.empty(0, dtype=np.float64)
     return Keypoints(
         np.empty((0, 2), dtype=np.float64),
@@ -130,7 +131,7 @@ def _describe(
     sift: cv2.SIFT, image: NDArray[np.uint8], found: list[cv2.KeyPoint], root: bool
 ) -> Keypoints:
     if not found:
-        return _no_keypoints()
+        return no_keypoints()
     described, computed = sift.compute(image, found)
     descriptors = np.asarray(computed, dtype=np.float32)
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in described], dtype=np.float64)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from geodelreg.fit.select import spatial_blocks
-from geodelreg.pipeline.search import Hypothesis
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import FloatArray
@@ -16,7 +15,7 @@ _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
 
 
-def warnings_of(pair: Pair, solution: Solution, hypothesis: Hypothesis) -> tuple[str, ...]:
+def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
     """Warnings about a solution, in plain words."""
     notes: list[str] = []
     if not pair.source_is_coarser:
@@ -26,7 +25,7 @@ def warnings_of(pair: Pair, solution: Solution, hypothesis: Hypothesis) -> tuple
         )
     if pair.mapping.operation.warning:
         notes.append(pair.mapping.operation.warning)
-    if hypothesis.bright is not None:
+    if solution.without_bright:
         notes.append("bright objects (clouds?) move differently from the ground and were left out")
     if solution.transformation.model in ("similarity", "affine"):
         notes.append(

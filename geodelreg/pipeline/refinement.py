@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -34,23 +33,41 @@ from geodelreg.types import FloatArray, Status
 _PASSES = 3
 COARSE_SIGMA = 0.35
 _COARSE_FROM = 1.5
-_PLAIN = (0.0, False)
-_HAZE = (1.0, False)
-_SHARPER = ((1.5, True), (1.0, True))
+Look = tuple[float, bool]  # high-pass and local tone, as in `Tuning`
+_PLAIN: Look = (0.0, False)
+_HAZE: Look = (1.0, False)
+_SHARPER: tuple[Look, ...] = ((1.5, True), (1.0, True))
 _CLEARLY = 0.8
 _MOVE_PX = 0.1
+_CONTRADICTION_SIGMAS = 4.0
+_CONTRADICTION_FLOOR_PX = 0.05
 _SHARPER_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """Tiles, what is known of the sensors, and the last pass over all patches."""
+    """Where the passes ended.
+
+    Attributes
+    ----------
+    tiles : list of Tile
+    tuning : Tuning
+    dense : Dense
+        The last pass over all patches; its estimate is not None.
+    matrix : (2, 3) float64
+        MS pixels to MS header pixels.
+    size : int
+        Side of a patch, template pixels.
+    without_bright : bool
+        Bright objects were left out, because with them the patches agree on something else.
+    """
 
     tiles: list[Tile]
     tuning: Tuning
     dense: Dense
     matrix: FloatArray
     size: int
+    without_bright: bool = False
 
 
 def thread_count(pair: Pair) -> int:
@@ -69,27 +86,62 @@ def refine_densely(
         return None
     threads, size = thread_count(part.pair), patch_size(region)
     tiles = read_tiles(part, plan_tiles(region), matrix, threads)
-    if hypothesis.bright is not None:
-        tiles = [_without_bright(part, tile, hypothesis) for tile in tiles]
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
-    if not tiles:
-        return None
-    refined = _passes(part, tiles, hypothesis, matrix, RefineOptions(size=size))
+    options = RefineOptions(size=size)
+    refined = _of_the_ground(part, tiles, hypothesis, matrix, options) if tiles else None
     timings["refine"] = perf_counter() - start
     return refined
 
 
-def _passes(
-    part: Roles, tiles: list[Tile], hypothesis: Hypothesis, matrix: FloatArray,
+def _of_the_ground(
+    part: Roles,
+    tiles: list[Tile],
+    hypothesis: Hypothesis,
+    matrix: FloatArray,
     options: RefineOptions,
-) -> Refinement | None:  # fmt: skip
+) -> Refinement | None:
+    """Refine on all pixels, unless those off bright objects (clouds?) say something else.
+
+    Clouds are bright and smooth, and move; the ground is darker, has sharp edges, and does not.
+    """
+    if hypothesis.bright is None:
+        return _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
+    hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
+    ground = _passes(part, hidden, matrix, options, (_HAZE, _PLAIN))
+    begin = matrix if ground is None else ground.matrix
+    everything = _passes(part, tiles, begin, options, (_PLAIN, *_SHARPER))
+    if ground is None or everything is None:
+        return ground or everything
+    gap, sigma = _difference(part, ground.dense, everything.dense)
+    if gap > _CONTRADICTION_SIGMAS * sum(sigma) + _CONTRADICTION_FLOOR_PX:
+        return replace(ground, without_bright=True)
+    return ground if sigma[0] < sigma[1] else everything
+
+
+def _difference(part: Roles, one: Dense, other: Dense) -> tuple[float, tuple[float, float]]:
+    """Largest distance over the MS raster of two estimates, and the mean standard error of each."""
+    assert one.estimate is not None
+    assert other.estimate is not None
+    where = part.pair.lattice()
+    gap = one.estimate.transformation(where) - other.estimate.transformation(where)
+    sigma = [float(e.sigma_at(where).mean()) for e in (one.estimate, other.estimate)]
+    return float(np.hypot(*gap.T).max()), (sigma[0], sigma[1])
+
+
+def _passes(
+    part: Roles,
+    tiles: list[Tile],
+    matrix: FloatArray,
+    options: RefineOptions,
+    looks: tuple[Look, ...],
+) -> Refinement | None:
+    """Passes with the first way to look at the images, then the others if they are sharper."""
     threads = thread_count(part.pair)
-    haze = _HAZE if hypothesis.bright is not None else _PLAIN
     sigma, dense, tuning = DEFAULT_SIGMA, None, None
     for number in range(_PASSES):
         tone = fit_tone(part, tiles, matrix, sigma)
-        tuning = Tuning(sigma, tone, *haze)
+        tuning = Tuning(sigma, tone, *looks[0])
         if number == 1:
             sigma = fit_sigma(part, tiles, matrix, tuning)
             tuning = replace(tuning, sigma=sigma)
@@ -100,27 +152,27 @@ def _passes(
     if dense is None or tuning is None:
         return None
     best = Refinement(tiles, tuning, dense, matrix, options.size)
-    others = _SHARPER if hypothesis.bright is None else (_PLAIN,)
-    best = _sharpest(part, best, others, options, threads)
+    best = _sharpest(part, best, looks[1:], options, threads)
     return best if best.dense.estimate is not None else None
 
 
 def _sharpest(
     part: Roles,
     plain: Refinement,
-    others: tuple[tuple[float, bool], ...],
+    others: tuple[Look, ...],
     options: RefineOptions,
     threads: int,
 ) -> Refinement:
     """Try edges alone, with each patch's own tone: better where light or land changed."""
-    best, changed, wary = plain, False, bool(plain.tuning.high_pass)
+    best, changed = plain, False
     for high_pass, local_tone in others:
         local = local_tone and part.ms_is_template()
         tuning = replace(plain.tuning, high_pass=high_pass, local_tone=local)
         dense = match_pass(part, plain.tiles, best.matrix, tuning, options, threads)
-        clearly = 1.0 if changed else _CLEARLY
-        if not _is_sharper(part, dense, best.dense, clearly, _MOVE_PX if wary else math.inf):
+        if not _is_sharper(part, dense, best.dense, 1.0 if changed else _CLEARLY):
             break
+        if plain.tuning.high_pass and _moved(part, dense, best.dense):
+            break  # more certain of another place is no gain where clouds are about
         assert dense.estimate is not None
         matrix = dense.estimate.transformation.matrix
         best, changed = replace(best, tuning=tuning, dense=dense, matrix=matrix), True
@@ -132,18 +184,17 @@ def _sharpest(
     return replace(best, dense=dense, matrix=dense.estimate.transformation.matrix)
 
 
-def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float, move_px: float) -> bool:
-    """True when a pass is more certain, by a factor, than another without losing many patches."""
+def _moved(part: Roles, one: Dense, other: Dense) -> bool:
+    return other.estimate is not None and _difference(part, one, other)[0] > _MOVE_PX
+
+
+def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float) -> bool:
+    """True when a pass is more certain, by a factor, without losing many patches."""
     if one.estimate is None or other.estimate is None:
         return one.estimate is not None
-    where = part.pair.lattice()
     kept = [int((dense.status == Status.KEPT).sum()) for dense in (one, other)]
-    sigma = [float(e.sigma_at(where).mean()) for e in (one.estimate, other.estimate)]
-    if kept[0] < _SHARPER_SHARE * kept[1] or sigma[0] >= factor * sigma[1]:
-        return False
-    # more certain of another place is no gain where clouds are about: they are not the ground
-    gap = one.estimate.transformation(where) - other.estimate.transformation(where)
-    return bool(np.hypot(*gap.T).max() < move_px)
+    sigma = _difference(part, one, other)[1]
+    return kept[0] >= _SHARPER_SHARE * kept[1] and sigma[0] < factor * sigma[1]
 
 
 def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:

@@ -78,7 +78,7 @@ def register(
         run = solve if options.method == "delaunay" else solve_baseline
         solution = run(pair, hypothesis)
         if solution is not None:
-            solution = _finish(pair, solution, hypothesis, found)
+            solution = _finish(pair, solution, found)
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return pair, solution
@@ -140,10 +140,10 @@ def area_hypothesis(pair: Pair, images: WorkingPair) -> Hypothesis:
     return Hypothesis(matrix, float("nan"), {}, images)
 
 
-def _finish(pair: Pair, solution: Solution, hypothesis: Hypothesis, found_s: float) -> Solution:
+def _finish(pair: Pair, solution: Solution, found_s: float) -> Solution:
     return replace(
         solution,
-        warnings=solution.warnings + warnings_of(pair, solution, hypothesis),
+        warnings=solution.warnings + warnings_of(pair, solution),
         timings_s={"search": found_s, **solution.timings_s},
     )
 

@@ -22,7 +22,7 @@ from geodelreg.match.descriptors import (
     ratio_test,
     select,
 )
-from geodelreg.match.keypoints import KeypointOptions, detect
+from geodelreg.match.keypoints import KeypointOptions, detect, no_keypoints
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import Band, BoolArray, FloatArray, Keypoints, Matches, Window
 
@@ -33,6 +33,7 @@ SECOND_BUDGET_PX = 1_600_000
 FIRST_KEYPOINTS = 1500
 SECOND_KEYPOINTS = 8000
 _THRESHOLD_PX = 1.0
+_CONTRADICTION = 1.5
 _CHANCE_LOG_NFA = -2.0
 _SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
@@ -89,15 +90,18 @@ class Hypothesis:
     counts : dict of str to int
         Points that survive each step.
     pair : WorkingPair
+    matches : tuple of (N, 2) float64, or None
+        MS pixels and MS header pixels of the keypoint matches that agree.
     bright : tuple of (H, W) bool, or None
-        Where the source and the reference of `pair` show bright objects, when those agree on
-        something else: to be kept out of the refinement.
+        Where the source and the reference of `pair` show bright objects, if they do: the
+        refinement looks whether they move differently from the rest.
     """
 
     matrix: FloatArray
     log_nfa: float
     counts: dict[str, int]
     pair: WorkingPair
+    matches: tuple[FloatArray, FloatArray] | None = None
     bright: tuple[BoolArray, BoolArray] | None = None
 
 
@@ -160,16 +164,21 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     Stops after the first way that is beyond doubt; a weak one is followed by those of other bands.
     """
     found: list[Hypothesis] = []
-    try:
-        reference = _detect(images.reference, False, pair, images.scope)
-    except NoDataError:
-        return
+    reference = _detect(images.reference, False, pair, images.scope)
+    bright = bright_mask(images.reference)
+    dark_reference = None if bright is None else _hidden(images.reference, bright)
+    dark_keypoints: Keypoints | None = None
     for band in _views(images.source):
-        try:
-            keypoints = _detect(band, _mirrored(pair), pair, images.scope)
-        except NoDataError:
-            continue
-        agreed = _hypotheses_of(pair, images, band, keypoints, reference)
+        everywhere = _match_view(pair, images, band, reference)
+        agreed = [] if everywhere is None else [everywhere]
+        mine = bright_mask(band) if dark_reference is not None else None
+        if mine is not None and bright is not None and dark_reference is not None:
+            if dark_keypoints is None:
+                dark_keypoints = _detect(dark_reference, False, pair, images.scope)
+            ground = _match_view(pair, images, _hidden(band, mine), dark_keypoints)
+            agreed = [
+                replace(h, bright=(mine, bright)) for h in _in_doubt(pair, ground, everywhere)
+            ]
         if any(hypothesis.log_nfa < _SURE_LOG_NFA for hypothesis in agreed):
             yield from agreed
             return
@@ -177,45 +186,41 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     yield from sorted(found, key=lambda h: h.log_nfa)[:3]
 
 
-def _hypotheses_of(
-    pair: Pair, images: WorkingPair, band: Band, source: Keypoints, reference: Keypoints
+def _in_doubt(
+    pair: Pair, ground: Hypothesis | None, everywhere: Hypothesis | None
 ) -> list[Hypothesis]:
-    """What all matches agree on, preceded by what those off bright objects say if that differs.
+    """What the dark areas say first, unless all areas say the same.
 
-    Clouds move between the images, consistently and with many keypoints; the ground does not.
+    Clouds are bright; they move between the images, consistently and with many keypoints.
     """
-    matched = _one_to_one(pair, source, reference)
-    if matched is None:
-        return []
-    matches, counts = matched
-    everywhere = _agree(pair, images, (source, reference), matches, counts)
-    bright_source, bright_reference = bright_mask(band), bright_mask(images.reference)
-    if bright_source is None or bright_reference is None:
-        return [everywhere] if everywhere else []
-    upright = bright_source[::-1] if _mirrored(pair) else bright_source
-    dark = ~_look_up(upright, source.xy[matches.source_index])
-    dark &= ~_look_up(bright_reference, reference.xy[matches.reference_index])
-    clear = _agree(pair, images, (source, reference), select(matches, dark), counts)
-    if clear is None or clear.log_nfa > _SURE_LOG_NFA or everywhere is None:
-        return [h for h in (everywhere, clear) if h is not None]
-    if _far_apart(pair, clear, everywhere):
-        return [replace(clear, bright=(bright_source, bright_reference)), everywhere]
+    found = [hypothesis for hypothesis in (ground, everywhere) if hypothesis is not None]
+    if ground is None or everywhere is None or _contradicts(pair, ground, everywhere):
+        return found
     return [everywhere]
 
 
-def _look_up(mask: BoolArray, xy: FloatArray) -> BoolArray:
-    index = np.floor(xy).astype(np.intp)
-    rows = np.clip(index[:, 1], 0, mask.shape[0] - 1)
-    return np.asarray(mask[rows, np.clip(index[:, 0], 0, mask.shape[1] - 1)])
+def _hidden(band: Band, mask: BoolArray) -> Band:
+    return replace(band, valid=band.valid & ~mask)
 
 
-def _far_apart(pair: Pair, one: Hypothesis, other: Hypothesis) -> bool:
-    """True when two hypotheses differ somewhere by more than matching noise."""
-    corners = pair.corners()
-    gap = apply_affine(affine_from_matrix(one.matrix), corners)
-    gap -= apply_affine(affine_from_matrix(other.matrix), corners)
-    working_px = _working_gsd_m(pair, one.pair.scope) / min(pair.source_gsd_m)
-    return float(np.abs(gap).max()) > _THRESHOLD_PX * working_px
+def _match_view(
+    pair: Pair, images: WorkingPair, band: Band, reference: Keypoints
+) -> Hypothesis | None:
+    source = _detect(band, _mirrored(pair), pair, images.scope)
+    matched = _one_to_one(pair, source, reference)
+    if matched is None:
+        return None
+    return _agree(pair, images, (source, reference), *matched)
+
+
+def _contradicts(pair: Pair, clear: Hypothesis, everywhere: Hypothesis) -> bool:
+    """True when most matches of one hypothesis do not fit the other."""
+    assert clear.matches is not None
+    source_px, header_px = clear.matches
+    gap = apply_affine(affine_from_matrix(everywhere.matrix), source_px) - header_px
+    working_px = _working_gsd_m(pair, clear.pair.scope) / np.array(pair.source_gsd_m)
+    off = np.hypot(*(gap / working_px).T) > _CONTRADICTION * _THRESHOLD_PX
+    return bool(off.mean() > 0.5)
 
 
 def _views(bands: list[Band]) -> Iterator[Band]:
@@ -252,7 +257,10 @@ def _mirrored(pair: Pair) -> bool:
 
 
 def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
-    image, valid = to_uint8(band), band.valid
+    try:
+        image, valid = to_uint8(band), band.valid
+    except NoDataError:
+        return no_keypoints()
     options = KeypointOptions(max_keypoints=min(scope.keypoints, pair.options.max_keypoints))
     if not flip:
         return detect(image, valid, options)
@@ -306,7 +314,7 @@ def _agree(
     header = pair.mapping.inverse(full_reference)
     kind = "affine" if inliers.sum() >= 12 else "similarity"
     correction = fit_matrix(full_source, header, kind)
-    return Hypothesis(correction, surprise, counts, images)
+    return Hypothesis(correction, surprise, counts, images, (full_source, header))
 
 
 def _widen(

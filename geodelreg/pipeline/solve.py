@@ -48,6 +48,8 @@ class Solution:
     step_counts : dict of str to int
     band_weights : dict of str to float
     warnings : tuple of str
+    without_bright : bool
+        Bright objects were left out, because they move differently.
     timings_s : dict of str to float
     """
 
@@ -58,6 +60,7 @@ class Solution:
     step_counts: dict[str, int]
     band_weights: dict[str, float]
     warnings: tuple[str, ...]
+    without_bright: bool
     timings_s: dict[str, float]
 
 
@@ -165,6 +168,7 @@ def conclude(
         fitted.counts,
         weights,
         (),
+        refined.without_bright,
         timings,
     )
 
