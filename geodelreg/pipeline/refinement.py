@@ -8,6 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
+from geodelreg.fit.models import IDENTITY
 from geodelreg.match.refine import RefineOptions
 from geodelreg.pipeline.dense import (
     DEFAULT_SIGMA,
@@ -31,6 +32,7 @@ from geodelreg.pipeline.tiles import (
 from geodelreg.types import FloatArray, Status
 
 _PASSES = 3
+_NEAR_HEADER_PX = 4.0
 COARSE_SIGMA = 0.35
 _COARSE_FROM = 1.5
 Look = tuple[float, bool]  # high-pass and local tone, as in `Tuning`
@@ -108,7 +110,9 @@ def _of_the_ground(
     if hypothesis.bright is None:
         return _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
     hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
-    ground = _passes(part, hidden, matrix, options, (_HAZE, _PLAIN))
+    starts = [matrix, IDENTITY] if _near_header(part, matrix) else [matrix]
+    found = [_passes(part, hidden, start, options, (_HAZE, _PLAIN)) for start in starts]
+    ground = min((one for one in found if one is not None), key=_scatter, default=None)
     begin = matrix if ground is None else ground.matrix
     everything = _passes(part, tiles, begin, options, (_PLAIN, *_SHARPER))
     if ground is None or everything is None:
@@ -117,6 +121,21 @@ def _of_the_ground(
     if gap > _CONTRADICTION_SIGMAS * sum(sigma) + _CONTRADICTION_FLOOR_PX:
         return replace(ground, without_bright=True)
     return ground if sigma[0] < sigma[1] else everything
+
+
+def _near_header(part: Roles, matrix: FloatArray) -> bool:
+    """True when the header is so close that patches could find the ground from there."""
+    corners = part.pair.corners()
+    gap = part.pair.to_reference(matrix, corners) - part.pair.to_reference(IDENTITY, corners)
+    step = max(part.pair.pan_px_per_source_px, 1.0)
+    return bool(np.hypot(*gap.T).max() < _NEAR_HEADER_PX * step)
+
+
+def _scatter(one: Refinement) -> float:
+    """Mean standard error: the start from which more patches agree more closely has less."""
+    assert one.dense.estimate is not None
+    spread = np.diag(one.dense.estimate.covariance)
+    return float(spread.sum())
 
 
 def _difference(part: Roles, one: Dense, other: Dense) -> tuple[float, tuple[float, float]]:
