@@ -14,7 +14,14 @@ from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.image.bright import bright_mask
 from geodelreg.image.stretch import to_uint8
-from geodelreg.match.consensus import consensus_keypoints, fit_matrix, log_nfa, radial_residuals
+from geodelreg.match.consensus import (
+    Consensus,
+    consensus_keypoints,
+    fit_matrix,
+    log_nfa,
+    radial_residuals,
+)
+from geodelreg.match.delaunay_filter import FilterOptions, filter_matches
 from geodelreg.match.descriptors import (
     match_descriptors,
     matched_xy,
@@ -24,7 +31,7 @@ from geodelreg.match.descriptors import (
 )
 from geodelreg.match.keypoints import KeypointOptions, detect, no_keypoints
 from geodelreg.pipeline.state import Pair
-from geodelreg.types import Band, BoolArray, FloatArray, Keypoints, Matches, Window
+from geodelreg.types import Band, BoolArray, FloatArray, Keypoints, Matches, Status, Window
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +41,9 @@ FIRST_KEYPOINTS = 1500
 SECOND_KEYPOINTS = 8000
 _THRESHOLD_PX = 1.0
 _CONTRADICTION = 1.5
+_LOOSE_PX = 2.0
+_FEWEST_MATCHES = 4
+_AFFINE_MATCHES = 12
 _CHANCE_LOG_NFA = -2.0
 _SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
@@ -270,7 +280,7 @@ def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
 def _one_to_one(
     pair: Pair, source: Keypoints, reference: Keypoints
 ) -> tuple[Matches, dict[str, int]] | None:
-    if len(source) < 4 or len(reference) < 4:
+    if min(len(source), len(reference)) < _FEWEST_MATCHES:
         return None
     nearest = match_descriptors(source, reference)
     counts = {"keypoints MS": len(source), "keypoints PAN": len(reference)}
@@ -289,7 +299,7 @@ def _agree(
     counts: dict[str, int],
 ) -> Hypothesis | None:
     """The correction that most matches agree on, unless chance would do as well."""
-    if len(matches) < 4:
+    if len(matches) < _FEWEST_MATCHES:
         return None
     source, reference = keypoints
     seed = pair.options.seed
@@ -299,11 +309,23 @@ def _agree(
     source_xy, reference_xy = matched_xy(source, reference, matches)
     if not np.isfinite(similar.matrix).all():
         return None
-    matrix, inliers = _widen(similar.matrix, source_xy, reference_xy)
+    loose = radial_residuals(similar.matrix, source_xy, reference_xy) <= _LOOSE_PX
+    mesh = filter_matches(
+        source_xy,
+        reference_xy,
+        matches.ratio,
+        FilterOptions(consensus_px=_LOOSE_PX, seed=seed),
+        Consensus(similar.matrix, loose),
+    )
+    inliers = mesh.status == Status.KEPT
+    counts = counts | {"consensus": int(loose.sum()), "Delaunay mesh": int(inliers.sum())}
+    if inliers.sum() < _FEWEST_MATCHES:
+        return None
+    kind = "affine" if inliers.sum() >= _AFFINE_MATCHES else "similarity"
+    matrix = fit_matrix(source_xy[inliers], reference_xy[inliers], kind)
     residual = radial_residuals(matrix, source_xy, reference_xy)
     area = float(images.reference.data.size)
-    surprise, _ = log_nfa(residual, area, 2, 2 * _THRESHOLD_PX)
-    counts = counts | {"consensus": int(inliers.sum())}
+    surprise, _ = log_nfa(residual, area, 2, _LOOSE_PX)
     logger.debug("%s: %s, log NFA %.1f", images.scope.name, counts, surprise)
     if surprise > _CHANCE_LOG_NFA:
         return None
@@ -312,25 +334,8 @@ def _agree(
     full_source = apply_affine(affine_from_matrix(to_source), source_xy[inliers])
     full_reference = apply_affine(affine_from_matrix(to_reference), reference_xy[inliers])
     header = pair.mapping.inverse(full_reference)
-    kind = "affine" if inliers.sum() >= 12 else "similarity"
     correction = fit_matrix(full_source, header, kind)
     return Hypothesis(correction, surprise, counts, images, (full_source, header))
-
-
-def _widen(
-    matrix: FloatArray, source_xy: FloatArray, reference_xy: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Let a similarity become an affine where its inliers allow: more of them are then found."""
-    inliers = radial_residuals(matrix, source_xy, reference_xy) <= _THRESHOLD_PX
-    for _ in range(3):
-        if inliers.sum() < 12:
-            break
-        trial = fit_matrix(source_xy[inliers], reference_xy[inliers], "affine")
-        near = radial_residuals(trial, source_xy, reference_xy) <= _THRESHOLD_PX
-        if near.sum() < inliers.sum():
-            break
-        matrix, inliers = trial, near
-    return matrix, inliers
 
 
 def _window_to_full(band: Band, full_transform: object, flipped: bool) -> FloatArray:

@@ -14,6 +14,7 @@ from geodelreg.fit.select import Selection, half_disagreement, select_model
 from geodelreg.geo.crs import linearise
 from geodelreg.match.area import Overlay, rival_correlation
 from geodelreg.match.consensus import log_nfa
+from geodelreg.match.delaunay_filter import star_filter
 from geodelreg.match.refine import RefineOptions
 from geodelreg.match.surface import make_surface
 from geodelreg.pipeline.accuracy import measure
@@ -31,6 +32,7 @@ from geodelreg.pipeline.tiles import Roles, overlap_corners, roles
 from geodelreg.types import Accuracy, FloatArray, Status, StatusArray, TiePoints, Verdict
 
 _NEGLIGIBLE_PX = 0.005
+_FEWEST_POINTS = 4
 _SURE_LOG_CHANCE = -12.0
 
 
@@ -95,14 +97,14 @@ def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
     refined = refine_densely(part, hypothesis, timings)
     if refined is None:
         return None
-    kept = refined.dense.status == Status.KEPT
+    status = _on_the_mesh(refined.dense)
+    kept = status == Status.KEPT
     points = refined.dense.observations.take(kept)
-    if len(points) < 4:
+    if len(points) < _FEWEST_POINTS:
         return None
     corners = pair.corners()
     negligible = _NEGLIGIBLE_PX / max(pair.pan_px_per_source_px, 1e-9)
     selection = select_model(points, pair.frame(), corners, pair.options.model, negligible)
-    status = refined.dense.status.copy()
     status[np.flatnonzero(kept)[~selection.estimate.inlier]] = Status.RESIDUAL
     matrix = selection.estimate.transformation.matrix
     tied = tie_points(part, refined.dense, matrix, status)
@@ -117,6 +119,19 @@ def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
     )
     timings["fit"] = perf_counter() - start - sum(timings.values())
     return conclude(part, hypothesis, refined, fitted, timings)
+
+
+def _on_the_mesh(dense: Dense) -> StatusArray:
+    """Status with the patches marked that disagree with their star on the Delaunay mesh.
+
+    Where nothing scatters beyond its own covariance there is nothing to find.
+    """
+    status = dense.status.copy()
+    kept = np.flatnonzero(status == Status.KEPT)
+    if dense.estimate is not None and dense.estimate.extra_variance_px2 > 0:
+        points = dense.observations.take(kept)
+        status[kept[~star_filter(points.source, points.target, points.covariance)]] = Status.STAR
+    return status
 
 
 def _patch_counts(refined: Refinement, points: TiePoints) -> dict[str, int]:
