@@ -1,0 +1,90 @@
+"""The documentation names everything there is, and nothing else."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import click
+import pytest
+
+from geodelreg import errors
+from geodelreg.fit.gate import Evidence, judge
+from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg_cli.main import COMMANDS, cli
+from geodelreg_cli.options import flags
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def error_classes() -> list[type[errors.GeodelregError]]:
+    return [
+        kind
+        for _, kind in inspect.getmembers(errors, inspect.isclass)
+        if issubclass(kind, errors.GeodelregError) and kind is not errors.GeodelregError
+    ]
+
+
+@pytest.mark.parametrize("kind", error_classes(), ids=lambda kind: kind.__name__)
+def test_every_refusal_is_explained_with_its_exit_code(
+    kind: type[errors.GeodelregError],
+) -> None:
+    page = (ROOT / "docs" / "when-it-refuses.md").read_text(encoding="utf-8")
+    section = page.partition(f"### `{kind.__name__}`")[2].partition("\n### ")[0]
+    assert f"exit {kind.exit_code}" in section
+    assert "**Cause.**" in section
+    assert "**Remedy.**" in section
+
+
+def test_no_refusal_is_explained_that_does_not_exist() -> None:
+    page = (ROOT / "docs" / "when-it-refuses.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^### `(\w+)`", page, re.M)) == {k.__name__ for k in error_classes()}
+
+
+def test_every_knob_is_a_flag_of_align() -> None:
+    command = cli.get_command(click.Context(cli), "align")
+    assert command is not None
+    offered = {flag for param in command.params for flag in param.opts}
+    knobs = [field.name for kind in (AlignOptions, WriteOptions) for field in fields(kind)]
+    for knob in knobs:
+        assert set(flags(knob)) <= offered
+
+
+def test_readme_lists_every_flag_of_align_and_no_other() -> None:
+    command = cli.get_command(click.Context(cli), "align")
+    assert command is not None
+    offered = {
+        max(param.opts, key=len) for param in command.params if isinstance(param, click.Option)
+    }
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = readme.partition("## Options")[2].partition("\n## ")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| `")]
+    listed = {flag for row in rows for flag in re.findall(r"`[^`]*?(--[a-z-]+)", row.split("|")[1])}
+    assert listed == offered
+
+
+def test_every_command_is_explained_in_the_user_guide() -> None:
+    guide = (ROOT / "docs" / "user-guide.md").read_text(encoding="utf-8")
+    for name in COMMANDS:
+        assert f"`geodelreg {name}" in guide
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name
+)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    missing = [x for x in links if "://" not in x and not (page.parent / x).exists()]
+    assert missing == []
+
+
+def test_the_gates_limits_are_those_in_the_method_page() -> None:
+    unknown = dict.fromkeys((field.name for field in fields(Evidence)), float("nan"))
+    reasons = judge(Evidence(**unknown), AlignOptions())
+    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    table = page.partition("## The gate")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| .* \| [≥≤] (.*) \|$", table, re.M)
+    documented = {name: float(limit.replace("−", "-")) for name, limit in rows}
+    assert documented == {reason.name: reason.limit for reason in reasons}
