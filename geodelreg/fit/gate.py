@@ -19,6 +19,8 @@ MAX_LOG_NFA = -4.0
 MAX_SIGMA_PX = 0.7
 MIN_COVERAGE = 0.05
 MAX_DISAGREEMENT_PX = 1.0
+MAX_RIVAL = 0.85
+MAX_RIVAL_MOTION = 0.5
 SYSTEMATIC_PX = 0.005
 SIGNIFICANCE = 3.0
 
@@ -46,6 +48,8 @@ class Evidence:
         Correlation at the best displaced place over that at the correction; near 1 = ambiguous.
     shift_px, rotation_deg, scale : float
         Of the correction, for the limits the user gave.
+    rival_motion : float
+        Patches that agree on another motion over those that agree on the correction's.
     """
 
     points: int
@@ -58,6 +62,7 @@ class Evidence:
     shift_px: float
     rotation_deg: float
     scale: float
+    rival_motion: float = 0.0
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -92,6 +97,12 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         _at_most(
             "rival", evidence.rival, MAX_RIVAL, "relative correlation of the best rival place"
         ),
+        _at_most(
+            "rival_motion",
+            evidence.rival_motion,
+            MAX_RIVAL_MOTION,
+            "patches agree on another motion for each that agrees on this one",
+        ),
     ]
     if options.max_shift_px is not None:
         reasons.append(
@@ -106,9 +117,6 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     if options.max_scale is not None:
         reasons.append(_at_most("max_scale", evidence.scale, options.max_scale, "scale factor"))
     return tuple(reasons)
-
-
-MAX_RIVAL = 0.85
 
 
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:

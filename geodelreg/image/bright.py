@@ -10,6 +10,7 @@ from geodelreg.types import Band, BoolArray
 _BINS = 256
 _GROWTH_PX = 5
 _SEPARATION = 3.5
+_LEAST_SPREAD = 1e-4
 
 
 def bright_threshold(band: Band) -> float | None:
@@ -28,7 +29,7 @@ def bright_threshold(band: Band) -> float | None:
     if len(values) < 256:
         return None
     low, high = np.percentile(values, [0.5, 99.5])
-    if not high > low:
+    if not high - low > _LEAST_SPREAD * max(abs(low), abs(high)):
         return None
     counts, edges = np.histogram(values, bins=_BINS, range=(float(low), float(high)))
     share = np.cumsum(counts) / max(int(counts.sum()), 1)

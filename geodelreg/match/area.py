@@ -16,6 +16,7 @@ from geodelreg.types import BoolArray, Float32Array, FloatArray
 _PIXELS = 90_000
 _NEAR_PX = 8
 _RIVAL_OVERLAP = 0.35
+_BLOCK_PX = 16
 _SEARCH_OVERLAP = 0.15
 _HIGH_PASS_SIGMA_PX = 4.0
 
@@ -46,7 +47,8 @@ def rival_correlation(overlay: Overlay) -> float:
     """Best correlation at another displacement over that in place; 0 to about 1.
 
     Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
-    that the images alone cannot tell.
+    that the images alone cannot tell.  The rival is the displacement at which the whole correlates
+    best; it is judged block by block, so that fields of inverted contrast do not cancel out.
 
     Returns
     -------
@@ -68,7 +70,40 @@ def rival_correlation(overlay: Overlay) -> float:
         return float("inf")
     near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
     scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
-    return float(scores.max()) / in_place
+    row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
+    moved = (middle_y - row, middle_x - column)
+    return min(float(scores.max()) / in_place, _rival_blocks(one * mask, other * mask, moved))
+
+
+def _rival_blocks(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
+    """Like `rival_correlation`, of the blocks' correlations with any sign, for one displacement."""
+    around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    here = max(_block_correlation(one, other, step) for step in around)
+    there = max(_block_correlation(one, other, (moved[0] + y, moved[1] + x)) for y, x in around)
+    return there / here if here > 0 else float("inf")
+
+
+def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
+    """Root mean square correlation of blocks of `one` with `other` at (rows, columns) further."""
+    height, width = one.shape
+    dy, dx = moved
+    first = one[max(-dy, 0) : min(height - dy, height), max(-dx, 0) : min(width - dx, width)]
+    second = other[max(dy, 0) : min(height + dy, height), max(dx, 0) : min(width + dx, width)]
+    a, b = _blocks(first), _blocks(second)
+    power = (a**2).sum(axis=1) * (b**2).sum(axis=1)
+    textured = power > 1e-6
+    if not textured.any():
+        return 0.0
+    return float(np.sqrt(((a * b).sum(axis=1)[textured] ** 2 / power[textured]).mean()))
+
+
+def _blocks(image: Float32Array) -> FloatArray:
+    """(N, n²) blocks less their means."""
+    rows, columns = (side // _BLOCK_PX for side in image.shape)
+    cut = image[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
+    parts = cut.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).swapaxes(1, 2)
+    values = parts.reshape(rows * columns, _BLOCK_PX**2).astype(np.float64)
+    return np.asarray(values - values.mean(axis=1, keepdims=True))
 
 
 def best_shift(overlay: Overlay) -> FloatArray:

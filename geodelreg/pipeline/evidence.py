@@ -13,13 +13,17 @@ from geodelreg.match.refine import Patches, cut_patches
 from geodelreg.match.surface import Surface, sample
 from geodelreg.pipeline.dense import Tuning, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
-from geodelreg.types import Band, FloatArray, IntArray
+from geodelreg.types import Band, FloatArray, IntArray, TiePoints
 
 _DISPLACED_RADII = (4.0, 9.0)
 _DIRECTIONS = 8
 _BY_CHANCE = 0.25
 _TESTED_PATCHES = 160
 _LEAST_SEEN = 0.6
+_LEAST_DISPLACED = 8
+_RIVAL_TOLERANCE = 0.2
+_RIVAL_SIGMA = 0.5
+_RIVAL_SCORE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +71,57 @@ def area_evidence(
         patches = cut_patches(bands, part.template.grid, size)
         chosen = np.arange(number % every, len(patches), every)
         scores = _explained(part, matrix, surface, patches, chosen, offsets)
-        tested += len(scores)
-        best += int((scores.argmax(axis=1) == 0).sum()) if len(scores) else 0
+        counts = best_in_place(scores)
+        tested, best = tested + counts[0], best + counts[1]
     return AreaEvidence(tested, best)
+
+
+def best_in_place(scores: FloatArray) -> tuple[int, int]:
+    """Patches that can be compared, and those among them that score best in place.
+
+    Parameters
+    ----------
+    scores : (P, K) float64
+        In place first, then at displaced places; NaN where a place cannot be seen.
+
+    Returns
+    -------
+    tested, best : int
+    """
+    seen = np.isfinite(scores)
+    enough = seen[:, 0] & (seen[:, 1:].sum(axis=1) >= _LEAST_DISPLACED)
+    ranked = np.where(seen[enough], scores[enough], -np.inf)
+    return int(enough.sum()), int((ranked.argmax(axis=1) == 0).sum()) if enough.any() else 0
+
+
+def rival_motion(points: TiePoints, unit_px: float) -> float:
+    """Patches that agree on another motion over those that agree on the correction's.
+
+    Clouds of one height move alike, and so do waves: where the correction follows one such layer,
+    the patches on the ground, or on the other layers, agree on something else.
+
+    Parameters
+    ----------
+    points : TiePoints
+        With residuals under the correction.
+    unit_px : float
+        PAN pixels to one pixel of the coarser image.
+
+    Returns
+    -------
+    float
+        0 where the rest agrees on nothing; infinite where no point is kept.
+    """
+    sharp = (points.sigma_px < _RIVAL_SIGMA * unit_px).all(axis=1)
+    tolerance = _RIVAL_TOLERANCE * unit_px
+    with np.errstate(invalid="ignore"):
+        away = np.hypot(*points.residual_px.T) > 2 * tolerance
+    rest = points.residual_px[~points.kept & sharp & away & (points.score > _RIVAL_SCORE)]
+    kept = int(points.kept.sum())
+    if not len(rest) or not kept:
+        return 0.0 if kept else float("inf")
+    gap = np.hypot(*(rest[:, None] - rest[None]).transpose(2, 0, 1))
+    return float((gap <= tolerance).sum(axis=1).max()) / kept
 
 
 def _explained(
@@ -82,7 +134,7 @@ def _explained(
 ) -> FloatArray:
     """(P, K) share of the surface's variance that the bands explain, per patch and offset.
 
-    Patches without texture or outside the surface are left out.
+    NaN where too little of the patch lies on the surface; patches without texture are left out.
     """
     size = patches.size
     picked = np.arange(0, size, 2)
@@ -93,21 +145,23 @@ def _explained(
     spots = (offsets[:, None, :] + inside[None]).reshape(-1, 2) * patches.step
     xy = patches.centre[chosen][:, None, :] + spots[None]
     there, usable = sample(surface, part.to_surface(matrix, xy))
-    there = there.reshape(len(chosen), len(offsets), -1).astype(np.float64)
-    seen = usable.reshape(there.shape).all(axis=1) & patches.valid[chosen][:, take]
-    good = seen.mean(axis=1) > _LEAST_SEEN
-    weight = seen[good][:, None, :].astype(np.float64)
-    bands = _centred(patches.values[chosen[good]][:, :, take].astype(np.float64), weight)
-    image = _centred(there[good], weight)
-    basis, _ = np.linalg.qr(bands.transpose(0, 2, 1))
-    explained = (np.matmul(image, basis) ** 2).sum(axis=2)
-    energy = np.maximum((image**2).sum(axis=2), 1e-12)
-    textured = (np.abs(bands).sum(axis=(1, 2)) > 0) & (energy.min(axis=1) > 1e-9)
-    return np.asarray((explained / energy)[textured])
+    shape = (len(chosen), len(offsets), len(take))
+    seen = usable.reshape(shape) & patches.valid[chosen][:, None, take]
+    weight = seen.astype(np.float64)[:, :, None]
+    values = patches.values[chosen][:, None, :, take].transpose(1, 2, 3, 0)
+    bands = _centred(values.astype(np.float64), weight)
+    image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
+    basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
+    explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
+    energy = np.maximum((image**2).sum(axis=(2, 3)), 1e-12)
+    good = seen.mean(axis=2) > _LEAST_SEEN
+    good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 1e-9)
+    return np.where(good, explained / energy, np.nan)
 
 
 def _centred(values: FloatArray, weight: FloatArray) -> FloatArray:
-    mean = (values * weight).sum(axis=2, keepdims=True) / weight.sum(axis=2, keepdims=True)
+    total = np.maximum(weight.sum(axis=-1, keepdims=True), 1.0)
+    mean = (values * weight).sum(axis=-1, keepdims=True) / total
     return np.asarray((values - mean) * weight)
 
 

@@ -19,7 +19,7 @@ from geodelreg.match.refine import RefineOptions
 from geodelreg.match.surface import make_surface
 from geodelreg.pipeline.accuracy import measure
 from geodelreg.pipeline.dense import Dense, Tuning, surface_sigma
-from geodelreg.pipeline.evidence import area_evidence, overlay
+from geodelreg.pipeline.evidence import area_evidence, overlay, rival_motion
 from geodelreg.pipeline.refinement import (
     COARSE_SIGMA,
     Refinement,
@@ -241,4 +241,5 @@ def _evidence(
         shift_px=float(np.hypot(*shift[0])),
         rotation_deg=abs(turn),
         scale=float(max(stretch[0], 1 / max(stretch[1], 1e-9))),
+        rival_motion=rival_motion(fitted.points, max(pair.pan_px_per_source_px, 1.0)),
     )

@@ -1,0 +1,99 @@
+"""Evidence of the gate on fields whose right verdict is known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from affine import Affine
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from geodelreg.fit.gate import MAX_RIVAL, MAX_RIVAL_MOTION
+from geodelreg.image.bright import bright_mask
+from geodelreg.match.area import Overlay, rival_correlation
+from geodelreg.pipeline.evidence import best_in_place, rival_motion
+from geodelreg.types import Band, Grid, Status, TiePoints
+
+SIDE = 140
+
+
+def texture(seed: int, shape: tuple[int, int] = (SIDE, SIDE)) -> NDArray[np.float32]:
+    noise = np.random.default_rng(seed).standard_normal(shape)
+    smooth = ndimage.gaussian_filter(noise, 1.5, mode="wrap")
+    return (100 * smooth / smooth.std()).astype(np.float32)
+
+
+def overlaid(template: NDArray[np.float32], surface: NDArray[np.float32]) -> Overlay:
+    everywhere = np.ones(template.shape, dtype=bool)
+    return Overlay(template, surface, everywhere, everywhere)
+
+
+def tie_points(residual: NDArray[np.float64], status: NDArray[np.uint8]) -> TiePoints:
+    count = len(residual)
+    spots = np.random.default_rng(0).uniform(0, 100, (count, 2))
+    return TiePoints(
+        source_px=spots,
+        reference_px=spots * 4,
+        covariance_px2=np.tile(np.eye(2) * 0.01, (count, 1, 1)),
+        score=np.full(count, 0.95),
+        status=status,
+        is_check=np.zeros(count, dtype=bool),
+        residual_px=residual,
+    )
+
+
+@pytest.mark.parametrize("period", [14, 23, 47])
+def test_repeated_texture_has_a_rival(period: int) -> None:
+    times = SIDE // period + 1
+    tile = texture(period, (period, period))
+    field = np.tile(tile, (times, times))[:SIDE, :SIDE]
+    noise = 10 * np.random.default_rng(1).standard_normal(field.shape).astype(np.float32)
+    assert rival_correlation(overlaid(field, field + noise)) > MAX_RIVAL
+
+
+def test_texture_has_no_rival() -> None:
+    field = texture(3)
+    assert rival_correlation(overlaid(field, field + 0.3 * texture(4))) < 0.7 * MAX_RIVAL
+
+
+def test_fields_of_inverted_contrast_are_no_rival() -> None:
+    """Bright fields that turned dark cancel the correlation of the whole, not that of its parts."""
+    field = texture(5)
+    rows, columns = np.mgrid[:SIDE, :SIDE] // 28
+    sign = np.where((rows + columns) % 2 == 0, 1.0, -1.0).astype(np.float32)
+    assert abs(np.corrcoef(field.ravel(), (field * sign).ravel())[0, 1]) < 0.1
+    assert rival_correlation(overlaid(field, field * sign)) < MAX_RIVAL
+
+
+def test_unseen_displaced_places_do_not_silence_a_patch() -> None:
+    scores = np.full((3, 17), 0.2)
+    scores[0, 0] = scores[1, 0] = 0.9
+    scores[:2, 9:] = np.nan
+    scores[2, 1:] = np.nan
+    assert best_in_place(scores) == (2, 2)
+
+
+def test_motion_of_clouds_is_a_rival() -> None:
+    """Eleven patches agree on clouds of one height, nine on those of another."""
+    rng = np.random.default_rng(2)
+    kept = 0.1 * rng.standard_normal((11, 2))
+    other = np.array([-7.7, 11.0]) + 0.2 * rng.standard_normal((9, 2))
+    stray = rng.uniform(-12, 12, (10, 2))
+    status = np.r_[np.zeros(11), np.full(19, Status.CONVERGENCE)].astype(np.uint8)
+    points = tie_points(np.concatenate([kept, other, stray]), status)
+    assert rival_motion(points, 4.0) > MAX_RIVAL_MOTION
+
+
+def test_strays_are_no_rival_motion() -> None:
+    rng = np.random.default_rng(3)
+    residual = np.concatenate([0.1 * rng.standard_normal((11, 2)), rng.uniform(-12, 12, (19, 2))])
+    status = np.r_[np.zeros(11), np.full(19, Status.CONVERGENCE)].astype(np.uint8)
+    assert rival_motion(tie_points(residual, status), 4.0) < MAX_RIVAL_MOTION
+
+
+def test_rounding_of_a_constant_is_not_bright() -> None:
+    """A spread of a few units in the last place of float32 cannot be cut into a histogram."""
+    data = np.full((64, 64), 1.0, dtype=np.float32)
+    data[::2] = np.nextafter(np.float32(1.0), np.float32(2.0))
+    grid = Grid(Affine.identity(), data.shape, "")
+    assert bright_mask(Band(data, np.ones(data.shape, dtype=bool), grid)) is None
