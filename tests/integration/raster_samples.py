@@ -83,7 +83,7 @@ def make_tiff(
 
 def make_cog(path: Path, encoding: str = "tiled-deflate", **options: Any) -> Path:
     """Write a cloud optimised GeoTIFF with overviews and a mask."""
-    plain = make_tiff(path.with_suffix(".plain.tif"), encoding, shape=(700, 900), mask="internal")
+    plain = make_tiff(path.with_suffix(".plain.tif"), encoding, shape=(300, 400), mask="internal")
     creation = {"BLOCKSIZE": "128", "COMPRESS": "DEFLATE", **options}
     gdal_copy(plain, path, driver="COG", **creation)
     plain.unlink()
