@@ -148,7 +148,7 @@ def _explained(
     shape = (len(chosen), len(offsets), len(take))
     seen = usable.reshape(shape) & patches.valid[chosen][:, None, take]
     weight = seen.astype(np.float64)[:, :, None]
-    values = patches.values[chosen][:, None, :, take].transpose(1, 2, 3, 0)
+    values = patches.values[chosen][:, None, :, take]
     bands = _centred(values.astype(np.float64), weight)
     image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))

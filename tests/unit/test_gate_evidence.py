@@ -2,19 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from affine import Affine
 from numpy.typing import NDArray
+from pyproj import CRS
 from scipy import ndimage
 
 from geodelreg.fit.gate import MAX_RIVAL, MAX_RIVAL_MOTION
+from geodelreg.fit.models import IDENTITY
 from geodelreg.image.bright import bright_mask
+from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay, rival_correlation
-from geodelreg.pipeline.evidence import best_in_place, rival_motion
-from geodelreg.types import Band, Grid, Status, TiePoints
+from geodelreg.options import AlignOptions
+from geodelreg.pipeline.dense import Tuning
+from geodelreg.pipeline.evidence import area_evidence, best_in_place, rival_motion
+from geodelreg.pipeline.state import make_pair
+from geodelreg.pipeline.tiles import read_tiles, roles
+from geodelreg.types import Band, Grid, Status, TiePoints, Window
 
 SIDE = 140
+
+
+@dataclass(frozen=True)
+class ArrayReader:
+    """One band in memory."""
+
+    band: Band
+    name: str = "array"
+    band_names: tuple[str, ...] = ("grey",)
+    decimations: tuple[float, ...] = (1.0,)
+
+    @property
+    def grid(self) -> Grid:
+        return self.band.grid
+
+    def read(
+        self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
+    ) -> list[Band]:
+        assert shape in (None, (window.height, window.width))
+        rows = slice(window.row, window.row + window.height)
+        columns = slice(window.column, window.column + window.width)
+        moved = self.grid.transform @ Affine.translation(window.column, window.row)
+        grid = Grid(moved, (window.height, window.width), self.grid.crs_wkt)
+        return [Band(self.band.data[rows, columns], self.band.valid[rows, columns], grid)]
 
 
 def texture(seed: int, shape: tuple[int, int] = (SIDE, SIDE)) -> NDArray[np.float32]:
@@ -71,6 +105,29 @@ def test_unseen_displaced_places_do_not_silence_a_patch() -> None:
     scores[:2, 9:] = np.nan
     scores[2, 1:] = np.nan
     assert best_in_place(scores) == (2, 2)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 5.0])
+def test_patches_score_best_where_their_content_is(shift_px: float) -> None:
+    """Rows beyond the PAN raster's lower edge are invalid: what they hide takes no part."""
+    ground = texture(7, (160, 160))
+    wkt = CRS.from_epsg(32616).to_wkt()
+    grid = Grid(Affine(2.0, 0.0, 5e5, 0.0, -2.0, 1e6), ground.shape, wkt)
+    valid = np.ones(ground.shape, dtype=bool)
+    valid[100:] = False
+    moved = Grid(Affine.translation(2 * shift_px, 0.0) @ grid.transform, ground.shape, wkt)
+    readers = (
+        ArrayReader(Band(ground, np.ones_like(valid), moved)),
+        ArrayReader(Band(ground, valid, grid)),
+    )
+    pair = make_pair(*readers, AlignOptions())
+    part, everything = roles(pair), Window(0, 0, 160, 160)
+    tiles = read_tiles(part, [everything], IDENTITY, 1)
+    tuning = Tuning(0.5, single_band(1, 0))
+    found = area_evidence(part, tiles, IDENTITY, tuning, 20, few=False)
+    assert found.tested >= 30
+    share = found.best_in_place / found.tested
+    assert share == 1.0 if shift_px == 0.0 else share < 0.5
 
 
 def test_motion_of_clouds_is_a_rival() -> None:
