@@ -43,6 +43,8 @@ _CLEARLY = 0.8
 _MOVE_PX = 0.1
 _CONTRADICTION_SIGMAS = 4.0
 _CONTRADICTION_FLOOR_PX = 0.05
+_CALM_SHARE = 0.9
+_CALM_SIGMA_PX = 0.02
 _SHARPER_SHARE = 0.6
 
 
@@ -87,7 +89,7 @@ def refine_densely(
     if region is None:
         return None
     threads, size = thread_count(part.pair), patch_size(region)
-    tiles = read_tiles(part, plan_tiles(region), matrix, threads)
+    tiles = read_tiles(part, plan_tiles(region, part.surface_px_per_template_px), matrix, threads)
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
     options = RefineOptions(size=size)
@@ -107,20 +109,38 @@ def _of_the_ground(
 
     Clouds are bright and smooth, and move; the ground is darker, has sharp edges, and does not.
     """
-    if hypothesis.bright is None:
-        return _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
+    everything = _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
+    if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
+        return everything
     hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
     starts = [matrix, IDENTITY] if _near_header(part, matrix) else [matrix]
     found = [_passes(part, hidden, start, options, (_HAZE, _PLAIN)) for start in starts]
     ground = min((one for one in found if one is not None), key=_scatter, default=None)
-    begin = matrix if ground is None else ground.matrix
-    everything = _passes(part, tiles, begin, options, (_PLAIN, *_SHARPER))
+    if ground is not None and not _agree(part, ground, everything):
+        everything = _passes(part, tiles, ground.matrix, options, (_PLAIN, *_SHARPER))
     if ground is None or everything is None:
         return ground or everything
-    gap, sigma = _difference(part, ground.dense, everything.dense)
-    if gap > _CONTRADICTION_SIGMAS * sum(sigma) + _CONTRADICTION_FLOOR_PX:
+    if not _agree(part, ground, everything):
         return replace(ground, without_bright=True)
+    sigma = _difference(part, ground.dense, everything.dense)[1]
     return ground if sigma[0] < sigma[1] else everything
+
+
+def _is_calm(dense: Dense) -> bool:
+    """True when nearly all textured patches agree to within their own noise."""
+    if dense.estimate is None:
+        return False
+    textured = dense.status != Status.TEXTURE
+    share = float((dense.status[textured] == Status.KEPT).mean()) if textured.any() else 0.0
+    return share > _CALM_SHARE and dense.estimate.extra_variance_px2 < _CALM_SIGMA_PX**2
+
+
+def _agree(part: Roles, one: Refinement, other: Refinement | None) -> bool:
+    """True when two refinements differ by no more than their standard errors allow."""
+    if other is None:
+        return False
+    gap, sigma = _difference(part, one.dense, other.dense)
+    return gap <= _CONTRADICTION_SIGMAS * sum(sigma) + _CONTRADICTION_FLOOR_PX
 
 
 def _near_header(part: Roles, matrix: FloatArray) -> bool:
@@ -171,7 +191,8 @@ def _passes(
     if dense is None or tuning is None:
         return None
     best = Refinement(tiles, tuning, dense, matrix, options.size)
-    best = _sharpest(part, best, looks[1:], options, threads)
+    if not _is_calm(dense):
+        best = _sharpest(part, best, looks[1:], options, threads)
     return best if best.dense.estimate is not None else None
 
 

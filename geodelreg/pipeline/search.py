@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -44,6 +45,7 @@ _CONTRADICTION = 1.5
 _LOOSE_PX = 2.0
 _FEWEST_MATCHES = 4
 _AFFINE_MATCHES = 12
+_CALM_SHARE = 0.9
 _CHANCE_LOG_NFA = -2.0
 _SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
@@ -176,24 +178,33 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     found: list[Hypothesis] = []
     reference = _detect(images.reference, False, pair, images.scope)
     bright = bright_mask(images.reference)
-    dark_reference = None if bright is None else _hidden(images.reference, bright)
-    dark_keypoints: Keypoints | None = None
+
+    @cache
+    def dark_reference() -> Keypoints:
+        assert bright is not None
+        return _detect(_hidden(images.reference, bright), False, pair, images.scope)
+
     for band in _views(images.source):
         everywhere = _match_view(pair, images, band, reference)
-        agreed = [] if everywhere is None else [everywhere]
-        mine = bright_mask(band) if dark_reference is not None else None
-        if mine is not None and bright is not None and dark_reference is not None:
-            if dark_keypoints is None:
-                dark_keypoints = _detect(dark_reference, False, pair, images.scope)
-            ground = _match_view(pair, images, _hidden(band, mine), dark_keypoints)
-            agreed = [
-                replace(h, bright=(mine, bright)) for h in _in_doubt(pair, ground, everywhere)
-            ]
+        mine = None if bright is None else bright_mask(band)
+        if mine is None or bright is None:
+            agreed = [] if everywhere is None else [everywhere]
+        else:
+            ground = None
+            if everywhere is None or not _is_calm(everywhere):
+                ground = _match_view(pair, images, _hidden(band, mine), dark_reference())
+            doubt = _in_doubt(pair, ground, everywhere)
+            agreed = [replace(hypothesis, bright=(mine, bright)) for hypothesis in doubt]
         if any(hypothesis.log_nfa < _SURE_LOG_NFA for hypothesis in agreed):
             yield from agreed
             return
         found.extend(agreed)
     yield from sorted(found, key=lambda h: h.log_nfa)[:3]
+
+
+def _is_calm(found: Hypothesis) -> bool:
+    """True when nearly all matches agree: nothing moves by itself."""
+    return found.counts["Delaunay mesh"] > _CALM_SHARE * found.counts["one to one"]
 
 
 def _in_doubt(

@@ -14,11 +14,13 @@ from geodelreg.types import Band, BoolArray, FloatArray, Grid, Window, WindowRea
 
 PATCH_PX = 20
 _SPREAD_TILE_PATCHES = 4
+_SPREAD_TILE_PATCHES_FINE = 3
+_FINE_RATIO = 2.5
 _ADJOINING_TILE_PATCHES = 8
-_MEMO = 2
+_MEMO = 1
 SMALLEST_PATCH_PX = 12
 _WANTED_PATCHES = 40
-_MOST_TILES_PER_AXIS = 8
+_MOST_TILES_PER_AXIS = 7
 _LOW_PASS_REACH = 4.0
 _SLACK_PX = 3.0
 
@@ -138,24 +140,28 @@ def patch_size(region: Window) -> int:
     return int(np.clip(round(float(side)), SMALLEST_PATCH_PX, PATCH_PX))
 
 
-def plan_tiles(region: Window) -> list[Window]:
+def plan_tiles(region: Window, ratio: float) -> list[Window]:
     """Template windows to visit: adjoining where there are few, else spread evenly.
 
     Parameters
     ----------
     region : Window
         Of the template, as from `overlap_in_template`.
+    ratio : float
+        Surface pixels to a template pixel; tiles of many surface pixels are made smaller, so that
+        all of them fit in memory.
     """
     size = patch_size(region)
-    columns = _spans(region.column, region.width, size)
-    rows = _spans(region.row, region.height, size)
+    patches = _SPREAD_TILE_PATCHES if ratio < _FINE_RATIO else _SPREAD_TILE_PATCHES_FINE
+    columns = _spans(region.column, region.width, size, patches)
+    rows = _spans(region.row, region.height, size, patches)
     return [Window(x, y, width, height) for y, height in rows for x, width in columns]
 
 
-def _spans(offset: int, length: int, size: int) -> list[tuple[int, int]]:
+def _spans(offset: int, length: int, size: int, patches: int) -> list[tuple[int, int]]:
     """(start, length) of the tiles along one axis; adjoining ones hold whole patches."""
-    tile = size * _SPREAD_TILE_PATCHES
-    if length > _MOST_TILES_PER_AXIS * tile:
+    tile = size * patches
+    if length > _MOST_TILES_PER_AXIS * size * _SPREAD_TILE_PATCHES:
         gaps = np.linspace(0, length - tile, _MOST_TILES_PER_AXIS)
         return [(offset + round(float(gap)), tile) for gap in gaps]
     tile, usable = size * _ADJOINING_TILE_PATCHES, length // size * size
