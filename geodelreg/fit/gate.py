@@ -119,6 +119,12 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     return tuple(reasons)
 
 
+def nothing_agrees() -> Reason:
+    """The reason when no transformation was found at all."""
+    message = "no transformation was found that enough places agree on"
+    return Reason("tie_points", 0.0, float(MIN_POINTS), False, message)
+
+
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:
     """Aligned or already aligned when every reason passed, else refused."""
     if not all(reason.passed for reason in reasons):

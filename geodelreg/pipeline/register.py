@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from geodelreg.errors import AlignmentRefusedError, NoDataError, NoOverlapError
+from geodelreg.errors import NoDataError, NoOverlapError
 from geodelreg.fit.models import IDENTITY
 from geodelreg.geo.affine import affine_from_matrix
 from geodelreg.match.area import best_shift
@@ -19,6 +19,7 @@ from geodelreg.pipeline.advice import warnings_of
 from geodelreg.pipeline.baseline import solve_baseline
 from geodelreg.pipeline.evidence import overlay
 from geodelreg.pipeline.search import (
+    WHOLE,
     Hypothesis,
     WorkingPair,
     keypoint_hypotheses,
@@ -26,7 +27,7 @@ from geodelreg.pipeline.search import (
     read_working_pair,
     scopes,
 )
-from geodelreg.pipeline.solve import Solution, solve
+from geodelreg.pipeline.solve import Solution, solve, unsolved
 from geodelreg.pipeline.state import Pair, Progress, make_pair
 from geodelreg.pipeline.tiles import roles
 from geodelreg.types import Correction, WindowReader
@@ -86,7 +87,7 @@ def register(
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
     if refused is None:
-        raise _nothing_found(pair)
+        refused = _nothing_found(pair)
     return pair, refused
 
 
@@ -156,18 +157,21 @@ def _better(one: Solution | None, other: Solution) -> Solution:
     return other if passed[1] > passed[0] else one
 
 
-def _nothing_found(pair: Pair) -> Exception:
-    names = f"{pair.source.name} and {pair.reference.name}"
-    if next(scopes(pair)).name == "both rasters whole":
-        return NoOverlapError(
-            f"{names} do not overlap by their headers, and their contents do not match",
+def _nothing_found(pair: Pair) -> Solution:
+    """The refusal when not even a hypothesis could be refined.
+
+    Raises
+    ------
+    NoOverlapError
+        When the headers do not overlap either.
+    """
+    if next(scopes(pair)).name == WHOLE:
+        raise NoOverlapError(
+            f"{pair.source.name} and {pair.reference.name} do not overlap by their headers, and "
+            "their contents do not match",
             "Check that both show the same ground and that CRSs and geotransforms are right.",
         )
-    return AlignmentRefusedError(
-        f"{names}: no transformation was found that enough places agree on",
-        "Check that both show the same ground; try --band with the band that looks most like PAN, "
-        "or a larger --search-radius.",
-    )
+    return unsolved()
 
 
 def correction_of(pair: Pair, solution: Solution) -> Correction:

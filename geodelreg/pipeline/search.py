@@ -38,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 FIRST_BUDGET_PX = 400_000
 SECOND_BUDGET_PX = 1_600_000
+WHOLE = "both rasters whole"
 FIRST_KEYPOINTS = 1500
 SECOND_KEYPOINTS = 8000
 _THRESHOLD_PX = 1.0
@@ -130,7 +131,7 @@ def scopes(pair: Pair) -> Iterator[Scope]:
         if _decimated(pair, Scope(*windows, FIRST_BUDGET_PX, 0, "")):
             yield Scope(*windows, SECOND_BUDGET_PX, SECOND_KEYPOINTS, "header overlap, finer")
     if windows != whole:
-        yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, SECOND_KEYPOINTS, "both rasters whole")
+        yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, SECOND_KEYPOINTS, WHOLE)
 
 
 def _decimated(pair: Pair, scope: Scope) -> bool:

@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from geodelreg.fit.gate import Evidence, is_worthwhile, judge, verdict
+from geodelreg.fit.gate import Evidence, is_worthwhile, judge, nothing_agrees, verdict
 from geodelreg.fit.models import IDENTITY, Transformation
 from geodelreg.fit.select import Selection, half_disagreement, select_model
 from geodelreg.geo.crs import linearise
@@ -119,6 +119,25 @@ def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
     )
     timings["fit"] = perf_counter() - start - sum(timings.values())
     return conclude(part, hypothesis, refined, fitted, timings)
+
+
+def unsolved() -> Solution:
+    """The refusal of a pair for which nothing was found that could be refined."""
+    none = np.empty((0, 2))
+    points = TiePoints(
+        none, none, np.empty((0, 2, 2)), none[:, 0], np.empty(0, np.uint8), none[:, 0] > 0, none
+    )
+    return Solution(
+        Transformation("none", IDENTITY),
+        points,
+        Accuracy(),
+        verdict((nothing_agrees(),), moves=False),
+        {"tie points": 0},
+        {},
+        (),
+        False,
+        {},
+    )
 
 
 def _on_the_mesh(dense: Dense) -> StatusArray:
