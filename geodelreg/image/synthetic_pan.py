@@ -14,6 +14,10 @@ _TUKEY = 3.0
 _TUKEY_WIDE = 4.0
 _MAX_CURVED_BANDS = 6
 _WORTHWHILE = 0.97
+_MOST_FALLING = 0.2
+_LEVERAGE = 3.0
+_CLEARLY = 0.7
+_MAD_TO_SIGMA = 1.4826
 
 
 def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
@@ -55,7 +59,8 @@ def robust_band_weights(bands: Float32Array, target: Float32Array) -> tuple[Floa
     """Weights of the bands, robust against clouds and changed pixels.
 
     Iteratively reweighted (Tukey's biweight) non-negative least squares with a free constant,
-    started from the least absolute deviations.
+    started from the least absolute deviations: of all pixels, and of those that are bright or dark
+    in no band (clouds that only the MS shows have leverage, which no residual betrays).
 
     Parameters
     ----------
@@ -72,7 +77,23 @@ def robust_band_weights(bands: Float32Array, target: Float32Array) -> tuple[Floa
         Weighted correlation of the combination with the target; 0 when all weights are zero.
     """
     x, y = bands.astype(np.float64), target.astype(np.float64)
-    trust = np.ones(y.shape)
+    weights, correlation, scale = _reweighted(x, y, np.ones(y.shape))
+    other, steadier, narrower = _reweighted(x, y, _unremarkable(x))
+    if narrower < _CLEARLY * scale and steadier > correlation:
+        return other, steadier
+    return weights, correlation
+
+
+def _unremarkable(x: FloatArray) -> FloatArray:
+    """(N,) 1 where no band is far from its median, else 0."""
+    gap = np.abs(x - np.median(x, axis=1, keepdims=True))
+    limit = _LEVERAGE * _MAD_TO_SIGMA * np.median(gap, axis=1, keepdims=True)
+    return np.asarray((gap <= limit).all(axis=0), dtype=np.float64)
+
+
+def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatArray, float, float]:
+    """Weights, correlation and robust spread of the residuals, from a first trust in pixels."""
+    trust = start
     weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
     for round_number in range(_ROUNDS):
         total = max(float(trust.sum()), 1e-30)
@@ -82,18 +103,18 @@ def robust_band_weights(bands: Float32Array, target: Float32Array) -> tuple[Floa
         weights = non_negative_weights(gram, moment)
         energy = float(weights @ gram @ weights)
         if energy <= 0:
-            return np.zeros(len(x)), 0.0
+            return np.zeros(len(x)), 0.0, np.inf
         correlation = float(weights @ moment) / np.sqrt(energy * float((trust * y0) @ y0))
         residual = np.abs(y0 - weights @ x0)
         if round_number < _ROUNDS // 2:
-            trust = 1.0 / np.maximum(residual, 1e-3 * float(y0.std()) + 1e-30)
-            scale = 1.4826 * float(np.median(residual))
+            trust = start / np.maximum(residual, 1e-3 * float(y0.std()) + 1e-30)
+            scale = _MAD_TO_SIGMA * float(np.median(residual))
             continue
-        scale = min(scale, 1.4826 * float(np.median(residual)))
+        scale = min(scale, _MAD_TO_SIGMA * float(np.median(residual)))
         trust = np.clip(1 - (residual / (_TUKEY * scale + 1e-30)) ** 2, 0, None) ** 2
         if trust.sum() < 16:
             break
-    return weights, correlation
+    return weights, correlation, scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,26 +208,64 @@ def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan
     stack = bands.astype(np.float64)
     low, high = np.percentile(stack, [0.2, 99.8], axis=1)
     centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), 1e-9)
-    left = target - weights @ stack
-    terms = np.stack([np.ones(len(target)), *_products(bands, centre, spread, low, high)], axis=1)
-    linear = (stack - centre[:, None]) / spread[:, None]
-    design = np.column_stack([terms, linear.T]) if len(bands) <= _MAX_CURVED_BANDS else terms[:, :1]
-    train = np.arange(len(target)) % 2 == 0
-    before = _robust_spread((left - np.median(left[train]))[~train])
-    fitted = _tukey_fit(design[train], left[train])
-    after = _robust_spread((left - design @ fitted)[~train])
     curvature = np.zeros(len(bands) * (len(bands) + 1) // 2)
-    if after < _WORTHWHILE * before:
-        fitted = _tukey_fit(design, left)
-        steeper = weights + fitted[1 + len(curvature) :] / spread
-        if (steeper < 0).any():
-            return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
-        curvature, weights = fitted[1 : 1 + len(curvature)], steeper
+    if len(bands) <= _MAX_CURVED_BANDS:
+        products = np.stack(list(_products(bands, centre, spread, low, high)), axis=1)
+        linear = ((stack - centre[:, None]) / spread[:, None]).T
+        fitted = _curved(products, linear, target - weights @ stack, weights * spread)
+        if fitted is not None:
+            curvature, weights = fitted[0], fitted[1] / spread
     return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
 
 
+def _curved(
+    products: Float32Array, linear: FloatArray, left: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Curvature and the linear weights beside it, of standardised bands; None to do without.
+
+    Only bands with a positive weight are bent: one that would lose it goes without.
+    """
+    first, second = np.triu_indices(len(weights))
+    constant = np.ones((len(left), 1))
+    free = weights > 0
+    while free.any():
+        used = free[first] & free[second]
+        design = np.column_stack([constant, products[:, used], linear[:, free]])
+        without = left + linear[:, ~free] @ weights[~free]
+        fitted = _tukey_fit(design, without)
+        curvature, steeper = np.zeros(len(first)), np.zeros(len(weights))
+        curvature[used] = fitted[1 : 1 + used.sum()]
+        steeper[free] = weights[free] + fitted[1 + used.sum() :]
+        if (steeper >= 0).all():
+            if _rises(curvature, steeper, linear) and _is_worthwhile(design, without, left):
+                return curvature, steeper
+            return None
+        free &= steeper > 0
+    return None
+
+
+def _rises(curvature: FloatArray, weights: FloatArray, linear: FloatArray) -> bool:
+    """True when brighter bands make the combination brighter, nearly everywhere.
+
+    Curvature that inverts the contrast of a band over part of its range describes changed fields
+    and lighting, not two sensors' tones, and spoils the small contrasts that are matched.
+    """
+    bend = np.zeros((len(weights), len(weights)))
+    bend[np.triu_indices(len(weights))] = curvature
+    slopes = weights + linear @ (bend + bend.T)
+    return bool(np.clip(-slopes, 0, None).sum() <= _MOST_FALLING * np.abs(slopes).sum())
+
+
+def _is_worthwhile(design: FloatArray, target: FloatArray, plain: FloatArray) -> bool:
+    """True when the design explains held-out samples better than a constant does `plain`."""
+    train = np.arange(len(target)) % 2 == 0
+    predicted = design @ _tukey_fit(design[train], target[train])
+    before = _robust_spread((plain - np.median(plain[train]))[~train])
+    return _robust_spread((target - predicted)[~train]) < _WORTHWHILE * before
+
+
 def _robust_spread(values: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(values)))
+    return _MAD_TO_SIGMA * float(np.median(np.abs(values)))
 
 
 def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
