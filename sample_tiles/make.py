@@ -19,6 +19,7 @@ SAMPLE = SceneSpec(
     pan_shape=(800, 800),
     ms_shape=(200, 200),
     pan_centre=(560.0, 700.0),
+    pan_weights=(0.12, 0.34, 0.36, 0.18),
 )
 
 
