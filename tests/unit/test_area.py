@@ -1,0 +1,107 @@
+"""Correlation of whole areas: sign and size of shifts, and rivals of repeated texture."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from geodelreg.match.area import Overlay, best_shift, rival_correlation
+
+Array = NDArray[np.float64]
+SIZE = 240
+
+
+def texture(seed: int = 0, size: int = 400, sigma: float = 1.5) -> Array:
+    """Fine and coarse structure together, as the ground has."""
+    noise = np.random.default_rng(seed).standard_normal((size, size))
+    levels = [s * ndimage.gaussian_filter(noise, s) for s in (sigma, 4 * sigma)]
+    return sum(levels) / np.std(sum(levels)) * 100 + 1000
+
+
+def cut(image: Array, column: int, row: int, shape: tuple[int, int] = (SIZE, SIZE)) -> Array:
+    return image[row : row + shape[0], column : column + shape[1]]
+
+
+def overlay(
+    template: Array,
+    surface: Array,
+    template_valid: NDArray[np.bool_] | None = None,
+    surface_valid: NDArray[np.bool_] | None = None,
+) -> Overlay:
+    every = np.ones(template.shape, bool)
+    return Overlay(
+        template.astype(np.float32),
+        surface.astype(np.float32),
+        every if template_valid is None else template_valid,
+        every if surface_valid is None else surface_valid,
+    )
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["same contrast", "inverted"])
+@pytest.mark.parametrize("shift", [(0, 0), (7, 0), (0, -12), (31, 22), (-60, 45)])
+def test_content_of_the_template_is_that_of_the_surface_so_much_further(
+    shift: tuple[int, int], sign: int
+) -> None:
+    ground = texture()
+    template = cut(ground, 80 + shift[0], 80 + shift[1])
+    surface = 2000 - sign * 0.4 * cut(ground, 80, 80)
+    assert best_shift(overlay(template, surface)) == pytest.approx(shift, abs=1.0)
+
+
+def test_shift_is_in_pixels_of_the_overlay_however_large_it_is() -> None:
+    ground = texture(1, 1100, 3.0)
+    template, surface = cut(ground, 90, 200, (700, 800)), cut(ground, 50, 230, (700, 800))
+    assert best_shift(overlay(template, surface)) == pytest.approx((40, -30), abs=4)
+
+
+def test_masked_pixels_do_not_pull_the_shift() -> None:
+    """A no-data frame that lies at the same place in both images must not win."""
+    ground = texture(2)
+    template, surface = cut(ground, 100, 60), cut(ground, 80, 80)
+    valid = np.ones((SIZE, SIZE), bool)
+    valid[:, :50], valid[200:] = False, False
+    spoilt = [np.where(valid, image, 0.0) for image in (template, surface)]
+    assert best_shift(overlay(*spoilt, valid, valid)) == pytest.approx((20, -20), abs=1)
+    other = valid[::-1, ::-1]
+    view = overlay(spoilt[0], np.where(other, surface, 9e4), valid, other)
+    assert best_shift(view) == pytest.approx((20, -20), abs=1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_natural_texture_has_no_rival(seed: int) -> None:
+    image = texture(seed)[:SIZE, :SIZE]
+    noise = np.random.default_rng(9).normal(0, 30, image.shape)
+    assert 0 < rival_correlation(overlay(image, image + noise)) < 0.6
+    assert 0 < rival_correlation(overlay(image, 3000 - image + noise)) < 0.6
+
+
+@pytest.mark.parametrize("period", [30, 48])
+def test_tiled_texture_rivals_itself(period: int) -> None:
+    image = np.tile(texture(3, period), (6, 9))[:180, :260]
+    noise = np.random.default_rng(9).normal(0, 10, image.shape)
+    assert rival_correlation(overlay(image, image + noise)) > 0.9
+
+
+def test_fields_of_inverted_contrast_do_not_make_a_rival() -> None:
+    """The whole correlates little where half of it is inverted; its blocks correlate well."""
+    image = texture(4)[:SIZE, :SIZE]
+    columns = np.arange(SIZE) // 40 % 2 == 0
+    turned = np.where(columns, 2000 - image, image)
+    assert rival_correlation(overlay(image, turned)) < 0.7
+
+
+def test_unrelated_images_have_rivals() -> None:
+    view = overlay(texture(5)[:SIZE, :SIZE], texture(6)[:SIZE, :SIZE])
+    assert rival_correlation(view) > 0.85
+
+
+def test_rivals_are_unknown_without_enough_to_look_at() -> None:
+    image = texture(7)
+    assert math.isnan(rival_correlation(overlay(image[:20, :20], image[:20, :20])))
+    nothing = np.zeros((SIZE, SIZE), bool)
+    square = image[:SIZE, :SIZE]
+    assert math.isnan(rival_correlation(overlay(square, square, nothing, nothing)))
