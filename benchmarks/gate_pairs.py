@@ -234,7 +234,7 @@ def _spec(case: Case, imagery: Imagery, rng: np.random.Generator) -> SceneSpec:
         ratio=ratio,
         pan_centre=textured_centre(imagery, side, rng),
         variant=variants.get(kind, ""),
-        ms_epsg=_other_zone(imagery.crs_wkt) if kind == "other CRS" else None,
+        ms_epsg=_other_zone(imagery) if kind == "other CRS" else None,
     )
 
 
@@ -254,12 +254,12 @@ def _header_error(kind: str, rng: np.random.Generator) -> HeaderError:
     return HeaderError(shift)
 
 
-def _other_zone(crs_wkt: str) -> int:
+def _other_zone(imagery: Imagery) -> int:
     """The neighbouring UTM zone; that of the place for geographic coordinates."""
     from pyproj import CRS
 
-    epsg = CRS.from_wkt(crs_wkt).to_epsg()
-    return epsg - 1 if epsg and 32602 <= epsg <= 32760 else {4326: 32611}.get(epsg or 0, 32613)
+    epsg = CRS.from_wkt(imagery.crs_wkt).to_epsg() or 0
+    return epsg - 1 if epsg != 4326 else 32601 + int((imagery.transform.c + 180) // 6)
 
 
 def textured_centre(
@@ -383,11 +383,11 @@ def _combine(
 ) -> Scene:
     """MS of one ground and PAN of another, on one header."""
     side = min(side, *(min(i.shape) for i in (one, other)))
-    shift = tuple(float(v) for v in rng.uniform(-30, 30, 2))
+    across, down = (float(v) for v in rng.uniform(-30, 30, 2))
     spec = SceneSpec(
         name=case.name,
         description=case.kind,
-        error=HeaderError(shift),
+        error=HeaderError((across, down)),
         pan_shape=(side, side),
         ms_shape=(round(0.8 * side / ratio), round(0.8 * side / ratio)),
         ratio=ratio,
@@ -449,6 +449,7 @@ def _procedural(case: Case, side: int, rng: np.random.Generator) -> Imagery:
     from pyproj import CRS
 
     shape = (side, side)
+    base: NDArray[np.floating[Any]]
     if case.kind == "all cloud":
         layer = cloud_layer(shape, 0.95, (0.0, 0.0), rng)
         base = 300.0 + layer.opacity * (layer.radiance - 300.0)

@@ -21,6 +21,8 @@ MIN_COVERAGE = 0.05
 MAX_DISAGREEMENT_PX = 1.0
 MAX_RIVAL = 0.85
 MAX_RIVAL_MOTION = 0.5
+MIN_SUPPORT = 0.8
+MAX_BANDS_APART_PX = 1.0
 SYSTEMATIC_PX = 0.005
 SIGNIFICANCE = 3.0
 
@@ -50,6 +52,10 @@ class Evidence:
         Of the correction, for the limits the user gave.
     rival_motion : float
         Patches that agree on another motion over those that agree on the correction's.
+    support : float
+        Share of the areas that resemble the other image that do so best in place.
+    bands_apart_px : float
+        Between where two MS bands, each by itself, put the ground, beyond their standard errors.
     """
 
     points: int
@@ -63,6 +69,8 @@ class Evidence:
     rotation_deg: float
     scale: float
     rival_motion: float = 0.0
+    support: float = 1.0
+    bands_apart_px: float = 0.0
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -102,6 +110,15 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
             evidence.rival_motion,
             MAX_RIVAL_MOTION,
             "patches agree on another motion for each that agrees on this one",
+        ),
+        _at_least(
+            "support", evidence.support, MIN_SUPPORT, "share of the areas correlates best in place"
+        ),
+        _at_most(
+            "bands_apart_px",
+            evidence.bands_apart_px,
+            MAX_BANDS_APART_PX,
+            "PAN px between the places of two MS bands, as of clouds",
         ),
     ]
     if options.max_shift_px is not None:

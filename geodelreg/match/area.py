@@ -15,8 +15,9 @@ from geodelreg.types import BoolArray, Float32Array, FloatArray
 
 _PIXELS = 90_000
 _NEAR_PX = 8
-_RIVAL_OVERLAP = 0.35
-_BLOCK_PX = 16
+_RIVAL_OVERLAP = 0.2
+_BLOCK_PX = 32  # of the image magnified twice
+_UNSUSPICIOUS = 0.5
 _SEARCH_OVERLAP = 0.15
 _HIGH_PASS_SIGMA_PX = 4.0
 
@@ -72,15 +73,28 @@ def rival_correlation(overlay: Overlay) -> float:
     scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
     row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
     moved = (middle_y - row, middle_x - column)
-    return min(float(scores.max()) / in_place, _rival_blocks(one * mask, other * mask, moved))
+    ratio = float(scores.max()) / in_place
+    if ratio < _UNSUSPICIOUS:
+        return ratio
+    by_block = _rival_blocks(one * mask, other * mask, moved)
+    return min(ratio, by_block) if np.isfinite(by_block) else ratio
 
 
 def _rival_blocks(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
-    """Like `rival_correlation`, of the blocks' correlations with any sign, for one displacement."""
-    around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    here = max(_block_correlation(one, other, step) for step in around)
-    there = max(_block_correlation(one, other, (moved[0] + y, moved[1] + x)) for y, x in around)
-    return there / here if here > 0 else float("inf")
+    """Like `rival_correlation`, of the blocks' correlations with any sign, for one displacement.
+
+    Displacements are tried to half a pixel, so that a period of no whole number fits; NaN where
+    no block can be compared.
+    """
+    finer = [cv2.resize(i, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for i in (one, other)]
+    first, second = (np.asarray(image, np.float32) for image in finer)
+    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
+
+    def best(dy: int, dx: int) -> float:
+        return max(_block_correlation(first, second, (2 * dy + y, 2 * dx + x)) for y, x in around)
+
+    here = best(0, 0)
+    return best(*moved) / here if here > 0 else float("nan")
 
 
 def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
@@ -93,7 +107,7 @@ def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int,
     power = (a**2).sum(axis=1) * (b**2).sum(axis=1)
     textured = power > 1e-6
     if not textured.any():
-        return 0.0
+        return float("nan")
     return float(np.sqrt(((a * b).sum(axis=1)[textured] ** 2 / power[textured]).mean()))
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from geodelreg.fit.gate import log10_binomial_tail
 from geodelreg.geo.pixel import pixel_centres
+from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay
-from geodelreg.match.refine import Patches, cut_patches
+from geodelreg.match.refine import Patches, RefineOptions, cut_patches
 from geodelreg.match.surface import Surface, sample
-from geodelreg.pipeline.dense import Tuning, tile_images
+from geodelreg.pipeline.dense import Tuning, match_pass, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
 from geodelreg.types import Band, FloatArray, IntArray, TiePoints
 
@@ -21,6 +23,9 @@ _BY_CHANCE = 0.25
 _TESTED_PATCHES = 160
 _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
+_RESEMBLES = 0.25
+_BANDS = 3
+_SURE_SIGMAS = 3.0
 _RIVAL_TOLERANCE = 0.2
 _RIVAL_SIGMA = 0.5
 _RIVAL_SCORE = 0.5
@@ -34,17 +39,35 @@ class AreaEvidence:
     ----------
     tested, best_in_place : int
         Textured patches, and those that correlate better in place than at any displaced place.
+    alike, alike_in_place : int
+        The same of patches that resemble the other image at any of the places.
     log_chance : float
-        log10 of the probability of that by chance.
+        log10 of the probability of `best_in_place` by chance.
     """
 
-    tested: int
-    best_in_place: int
+    tested: int = 0
+    best_in_place: int = 0
+    alike: int = 0
+    alike_in_place: int = 0
 
     @property
     def log_chance(self) -> float:
         """log10 P(as many by chance)."""
         return log10_binomial_tail(self.best_in_place, self.tested, _BY_CHANCE)
+
+    @property
+    def support(self) -> float:
+        """Share of the patches that resemble something that do so best in place; NaN of none."""
+        return self.alike_in_place / self.alike if self.alike else float("nan")
+
+    def plus(self, other: AreaEvidence) -> AreaEvidence:
+        """Of both together."""
+        return AreaEvidence(
+            self.tested + other.tested,
+            self.best_in_place + other.best_in_place,
+            self.alike + other.alike,
+            self.alike_in_place + other.alike_in_place,
+        )
 
 
 def area_evidence(
@@ -65,33 +88,71 @@ def area_evidence(
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
     every = max(len(tiles) * 16 // _TESTED_PATCHES, 1) if few else 1
-    tested = best = 0
+    found = AreaEvidence()
     for number, tile in enumerate(tiles):
         bands, surface = tile_images(part, tile, tuning)
         patches = cut_patches(bands, part.template.grid, size)
         chosen = np.arange(number % every, len(patches), every)
         scores = _explained(part, matrix, surface, patches, chosen, offsets)
-        counts = best_in_place(scores)
-        tested, best = tested + counts[0], best + counts[1]
-    return AreaEvidence(tested, best)
+        found = found.plus(best_in_place(scores))
+    return found
 
 
-def best_in_place(scores: FloatArray) -> tuple[int, int]:
-    """Patches that can be compared, and those among them that score best in place.
+def best_in_place(scores: FloatArray) -> AreaEvidence:
+    """Count the patches that score best in place.
 
     Parameters
     ----------
     scores : (P, K) float64
         In place first, then at displaced places; NaN where a place cannot be seen.
-
-    Returns
-    -------
-    tested, best : int
     """
     seen = np.isfinite(scores)
     enough = seen[:, 0] & (seen[:, 1:].sum(axis=1) >= _LEAST_DISPLACED)
     ranked = np.where(seen[enough], scores[enough], -np.inf)
-    return int(enough.sum()), int((ranked.argmax(axis=1) == 0).sum()) if enough.any() else 0
+    if not len(ranked):
+        return AreaEvidence()
+    best = ranked.argmax(axis=1) == 0
+    alike = ranked.max(axis=1) >= _RESEMBLES
+    return AreaEvidence(len(best), int(best.sum()), int(alike.sum()), int((best & alike).sum()))
+
+
+def bands_apart_px(
+    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int, threads: int
+) -> float:
+    """How far apart two bands put the ground by themselves, beyond their standard errors.
+
+    The detectors of a pushbroom sensor see a place one band after the other, from slightly
+    different directions.  The bands are made to agree on the ground, so what lies high above it,
+    or moves, is elsewhere in each: clouds contradict themselves, the ground does not.
+
+    Parameters
+    ----------
+    part, tiles, matrix, tuning, size, threads
+        As for `geodelreg.pipeline.dense.match_pass`.
+
+    Returns
+    -------
+    float
+        PAN pixels at the centre of the MS raster, of the two of the first three bands that are
+        furthest apart; 0 where fewer than two match.
+    """
+    pair = part.pair
+    height, width = pair.source.grid.shape
+    centre = np.array([[width / 2, height / 2]])
+    count = len(pair.source_bands)
+    found = []
+    for band in range(min(count, _BANDS) if count > 1 else 0):
+        alone = replace(tuning, tone=single_band(count, band), local_tone=False)
+        dense = match_pass(part, tiles, matrix, alone, RefineOptions(size=size), threads)
+        if dense.estimate is not None:
+            place = pair.to_reference(dense.estimate.transformation.matrix, centre)[0]
+            sigma = float(dense.estimate.sigma_at(centre)[0]) * pair.pan_px_per_source_px
+            found.append((sigma, place))
+    apart = [
+        float(np.hypot(*(here - there))) - _SURE_SIGMAS * float(np.hypot(one, other))
+        for (one, here), (other, there) in combinations(found, 2)
+    ]
+    return max([0.0, *apart])
 
 
 def rival_motion(points: TiePoints, unit_px: float) -> float:

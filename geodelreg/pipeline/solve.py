@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -19,11 +19,18 @@ from geodelreg.match.refine import RefineOptions
 from geodelreg.match.surface import make_surface
 from geodelreg.pipeline.accuracy import measure
 from geodelreg.pipeline.dense import Dense, Tuning, surface_sigma
-from geodelreg.pipeline.evidence import area_evidence, overlay, rival_motion
+from geodelreg.pipeline.evidence import (
+    AreaEvidence,
+    area_evidence,
+    bands_apart_px,
+    overlay,
+    rival_motion,
+)
 from geodelreg.pipeline.refinement import (
     COARSE_SIGMA,
     Refinement,
     refine_densely,
+    thread_count,
     working_tile,
 )
 from geodelreg.pipeline.search import Hypothesis
@@ -186,7 +193,14 @@ def conclude(
     area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
     if area.log_chance > _SURE_LOG_CHANCE:
         area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=False)
-    evidence = _evidence(pair, fitted, accuracy, area.log_chance, rival_correlation(after))
+    apart = bands_apart_px(
+        part, refined.tiles, matrix, refined.tuning, refined.size, thread_count(pair)
+    )
+    evidence = replace(
+        _evidence(pair, fitted, accuracy, area),
+        rival=rival_correlation(after),
+        bands_apart_px=apart,
+    )
     grid = pair.lattice()
     move = pair.to_reference(matrix, grid) - pair.to_reference(IDENTITY, grid)
     sigma = estimate.sigma_at(grid) * pair.pan_px_per_source_px
@@ -238,9 +252,8 @@ def _overlays(
     return overlay(part, template, surface, IDENTITY), overlay(part, template, surface, matrix)
 
 
-def _evidence(
-    pair: Pair, fitted: Fitted, accuracy: Accuracy, log_chance: float, rival: float
-) -> Evidence:
+def _evidence(pair: Pair, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence) -> Evidence:
+    """What needs no more pixels."""
     matrix = fitted.selection.estimate.transformation.matrix
     metric = np.array(pair.frame().metric).reshape(2, 2)
     ground = metric @ matrix[:, :2] @ np.linalg.inv(metric)
@@ -252,13 +265,14 @@ def _evidence(
     return Evidence(
         points=int(fitted.points.kept.sum()),
         log_nfa=fitted.log_nfa,
-        log_chance=log_chance,
+        log_chance=area.log_chance,
         coverage=accuracy.coverage,
         sigma_px=accuracy.sigma_corner_px,
         disagreement_px=fitted.disagreement_px,
-        rival=rival,
+        rival=float("nan"),
         shift_px=float(np.hypot(*shift[0])),
         rotation_deg=abs(turn),
         scale=float(max(stretch[0], 1 / max(stretch[1], 1e-9))),
         rival_motion=rival_motion(fitted.points, max(pair.pan_px_per_source_px, 1.0)),
+        support=area.support,
     )

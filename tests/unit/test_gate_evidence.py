@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy import ndimage
 
-from geodelreg.fit.gate import MAX_RIVAL, MAX_RIVAL_MOTION
+from geodelreg.fit.gate import MAX_BANDS_APART_PX, MAX_RIVAL, MAX_RIVAL_MOTION
 from geodelreg.fit.models import IDENTITY
 from geodelreg.image.bright import bright_mask
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay, rival_correlation
 from geodelreg.options import AlignOptions
 from geodelreg.pipeline.dense import Tuning
-from geodelreg.pipeline.evidence import area_evidence, best_in_place, rival_motion
+from geodelreg.pipeline.evidence import (
+    AreaEvidence,
+    area_evidence,
+    bands_apart_px,
+    best_in_place,
+    rival_motion,
+)
 from geodelreg.pipeline.state import make_pair
 from geodelreg.pipeline.tiles import read_tiles, roles
 from geodelreg.types import Band, Grid, Status, TiePoints, Window
@@ -29,16 +35,19 @@ SIDE = 140
 
 @dataclass(frozen=True)
 class ArrayReader:
-    """One band in memory."""
+    """Bands in memory."""
 
-    band: Band
+    bands: tuple[Band, ...]
     name: str = "array"
-    band_names: tuple[str, ...] = ("grey",)
     decimations: tuple[float, ...] = (1.0,)
 
     @property
     def grid(self) -> Grid:
-        return self.band.grid
+        return self.bands[0].grid
+
+    @property
+    def band_names(self) -> tuple[str, ...]:
+        return tuple(f"band {number}" for number in range(1, len(self.bands) + 1))
 
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
@@ -48,7 +57,8 @@ class ArrayReader:
         columns = slice(window.column, window.column + window.width)
         moved = self.grid.transform @ Affine.translation(window.column, window.row)
         grid = Grid(moved, (window.height, window.width), self.grid.crs_wkt)
-        return [Band(self.band.data[rows, columns], self.band.valid[rows, columns], grid)]
+        chosen = [self.bands[number - 1] for number in bands]
+        return [Band(band.data[rows, columns], band.valid[rows, columns], grid) for band in chosen]
 
 
 def texture(seed: int, shape: tuple[int, int] = (SIDE, SIDE)) -> NDArray[np.float32]:
@@ -104,7 +114,43 @@ def test_unseen_displaced_places_do_not_silence_a_patch() -> None:
     scores[0, 0] = scores[1, 0] = 0.9
     scores[:2, 9:] = np.nan
     scores[2, 1:] = np.nan
-    assert best_in_place(scores) == (2, 2)
+    assert best_in_place(scores) == AreaEvidence(2, 2, 2, 2)
+
+
+def test_areas_that_resemble_nothing_do_not_vote() -> None:
+    scores = np.full((4, 17), 0.1)
+    scores[0, 0] = scores[1, 3] = 0.9
+    found = best_in_place(scores)
+    assert (found.tested, found.alike, found.support) == (4, 2, 0.5)
+
+
+def test_narrow_overlap_of_repeated_texture_still_has_a_rival() -> None:
+    """Displaced by a period, the strip leaves no whole block to compare."""
+    tile = texture(9, (20, 20))
+    field = np.tile(tile, (7, 2))[:, :36]
+    assert rival_correlation(overlaid(field, field)) > MAX_RIVAL
+
+
+def two_bands(parallax_px: float) -> float:
+    """`bands_apart_px` where the second MS band sees everything displaced."""
+    ground = texture(8, (200, 200))
+    later = ndimage.shift(ground, (parallax_px, 0), order=3, mode="wrap").astype(np.float32)
+    wkt = CRS.from_epsg(32616).to_wkt()
+    grid = Grid(Affine(2.0, 0.0, 5e5, 0.0, -2.0, 1e6), ground.shape, wkt)
+    valid = np.ones(ground.shape, dtype=bool)
+    ms = ArrayReader((Band(ground, valid, grid), Band(later, valid, grid)))
+    pair = make_pair(ms, ArrayReader((Band(ground, valid, grid),)), AlignOptions())
+    part = roles(pair)
+    tiles = read_tiles(part, [Window(0, 0, 200, 200)], IDENTITY, 1)
+    return bands_apart_px(part, tiles, IDENTITY, Tuning(0.5, single_band(2, 0)), 20, 1)
+
+
+def test_bands_of_clouds_are_apart() -> None:
+    assert two_bands(1.3) > MAX_BANDS_APART_PX
+
+
+def test_bands_of_the_ground_are_together() -> None:
+    assert two_bands(0.0) < 0.01
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 5.0])
@@ -116,10 +162,8 @@ def test_patches_score_best_where_their_content_is(shift_px: float) -> None:
     valid = np.ones(ground.shape, dtype=bool)
     valid[100:] = False
     moved = Grid(Affine.translation(2 * shift_px, 0.0) @ grid.transform, ground.shape, wkt)
-    readers = (
-        ArrayReader(Band(ground, np.ones_like(valid), moved)),
-        ArrayReader(Band(ground, valid, grid)),
-    )
+    ms = ArrayReader((Band(ground, np.ones_like(valid), moved),))
+    readers = ms, ArrayReader((Band(ground, valid, grid),))
     pair = make_pair(*readers, AlignOptions())
     part, everything = roles(pair), Window(0, 0, 160, 160)
     tiles = read_tiles(part, [everything], IDENTITY, 1)
