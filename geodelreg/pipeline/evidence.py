@@ -25,6 +25,7 @@ _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
 _RESEMBLES = 0.25
 _BANDS = 3
+_BAND_TILES = 8
 _SURE_SIGMAS = 3.0
 _RIVAL_TOLERANCE = 0.2
 _RIVAL_SIGMA = 0.5
@@ -140,10 +141,11 @@ def bands_apart_px(
     height, width = pair.source.grid.shape
     centre = np.array([[width / 2, height / 2]])
     count = len(pair.source_bands)
+    some = tiles[:: max(len(tiles) // _BAND_TILES, 1)]
     found = []
     for band in range(min(count, _BANDS) if count > 1 else 0):
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
-        dense = match_pass(part, tiles, matrix, alone, RefineOptions(size=size), threads)
+        dense = match_pass(part, some, matrix, alone, RefineOptions(size=size), threads)
         if dense.estimate is not None:
             place = pair.to_reference(dense.estimate.transformation.matrix, centre)[0]
             sigma = float(dense.estimate.sigma_at(centre)[0]) * pair.pan_px_per_source_px
@@ -210,7 +212,8 @@ def _explained(
     seen = usable.reshape(shape) & patches.valid[chosen][:, None, take]
     weight = seen.astype(np.float64)[:, :, None]
     values = patches.values[chosen][:, None, :, take]
-    bands = _centred(values.astype(np.float64), weight)
+    alike = bool((seen == seen[:, :1]).all())  # then one basis serves all offsets
+    bands = _centred(values.astype(np.float64), weight[:, :1] if alike else weight)
     image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
