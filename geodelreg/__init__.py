@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from geodelreg import errors
-    from geodelreg.api import align, export_gcps, revert, write, write_in_place
+    from geodelreg.api import align, check, export_gcps, revert, write, write_in_place
     from geodelreg.options import AlignOptions, WriteOptions
+    from geodelreg.product.check import Check
     from geodelreg.types import Alignment
 
 __version__ = "0.1.0"
@@ -19,9 +20,11 @@ __version__ = "0.1.0"
 __all__ = [
     "AlignOptions",
     "Alignment",
+    "Check",
     "WriteOptions",
     "__version__",
     "align",
+    "check",
     "errors",
     "export_gcps",
     "revert",
@@ -32,8 +35,10 @@ __all__ = [
 _HOMES = {
     "AlignOptions": "geodelreg.options",
     "Alignment": "geodelreg.types",
+    "Check": "geodelreg.product.check",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
+    "check": "geodelreg.api",
     "export_gcps": "geodelreg.api",
     "revert": "geodelreg.api",
     "write": "geodelreg.api",

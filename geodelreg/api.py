@@ -2,25 +2,59 @@
 
 from __future__ import annotations
 
-import platform
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
-
-from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError
-from geodelreg.image.reader import check_band, open_raster
+from geodelreg.errors import (
+    AlignmentRefusedError,
+    NoDataError,
+    NoOverlapError,
+    OutputUnwritableError,
+    UsageError,
+)
+from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg.pipeline.check import (
+    is_affine_enough,
+    judge_misalignment,
+    measure_misalignment,
+)
 from geodelreg.pipeline.register import correction_of, register
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair, Progress
-from geodelreg.product.provenance import fingerprint, provenance_tags
-from geodelreg.types import Alignment, Correction, Gcp, Outcome
+from geodelreg.product.check import BandCheck, Check, band_check
+from geodelreg.product.provenance import fingerprint, provenance_tags, versions
+from geodelreg.types import (
+    Alignment,
+    CheckOutcome,
+    Correction,
+    Gcp,
+    Misalignment,
+    Outcome,
+)
 
 AnyPath = str | PathLike[str]
+MAX_LIMIT_PX = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class _Rasters:
+    """The two rasters, open, and their paths as the user named them."""
+
+    ms: RasterReader
+    pan: RasterReader
+    source_paths: tuple[str, ...]
+    reference_path: str
+
+
+@contextmanager
+def _open(source: AnyPath | Sequence[AnyPath], reference: AnyPath) -> Iterator[_Rasters]:
+    with open_raster(source) as ms, open_raster(reference) as pan:
+        yield _Rasters(ms, pan, _paths(source), str(reference))
 
 
 def align(
@@ -58,26 +92,12 @@ def align(
     """
     options = options or AlignOptions()
     start = perf_counter()
-    with open_raster(source) as ms, open_raster(reference) as pan:
-        if options.band:
-            check_band(ms, options.band)
-        check_band(pan, options.pan_band)
-        prints = {path: fingerprint(path) for path in (*_paths(source), str(reference))}
-        opened = perf_counter() - start
-        pair, solution = register(ms, pan, options, progress)
-        alignment = _alignment(source, reference, pair, solution)
-        notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
-    timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
-    alignment = replace(
-        alignment,
-        timings_s=timings,
-        warnings=alignment.warnings + notes,
-        extra={"fingerprints": prints},
-    )
+    with _open(source, reference) as rasters:
+        alignment, _ = _examine(rasters, options, progress, start)
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
         raise AlignmentRefusedError(
-            f"{ms.name} and {pan.name} were not aligned: " + "; ".join(failed),
+            f"{rasters.ms.name} and {rasters.pan.name} were not aligned: " + "; ".join(failed),
             "Check that both show the same ground; try --band with the band that looks most like "
             "PAN, a larger --search-radius, or a simpler --model.",
             alignment,
@@ -85,14 +105,131 @@ def align(
     return alignment
 
 
-def _alignment(
-    source: AnyPath | Sequence[AnyPath], reference: AnyPath, pair: Pair, solution: Solution
-) -> Alignment:
+def check(
+    source: AnyPath | Sequence[AnyPath],
+    reference: AnyPath,
+    options: AlignOptions | None = None,
+    *,
+    limit_px: float = 0.5,
+    per_band: bool = False,
+    progress: Progress | None = None,
+) -> Check:
+    """Tell whether a multispectral raster lies where a panchromatic one says; write nothing.
+
+    Parameters
+    ----------
+    source : path or sequence of paths
+        The MS raster, or one file per band.
+    reference : path
+        The PAN raster.
+    options : AlignOptions, optional
+        Its `tolerance_px` has no meaning here: whatever is found is measured.
+    limit_px : float
+        Largest misalignment, anywhere in the overlap, that counts as aligned, PAN pixels.
+    per_band : bool
+        Also match each band by itself.
+    progress : callable, optional
+        Called with a fraction 0 to 1 and the name of the step.
+
+    Returns
+    -------
+    Check
+        What the images do not support is the outcome ``cannot_tell``, not an error.
+
+    Raises
+    ------
+    UsageError
+        If `limit_px` is negative.
+    GeodelregError
+        Its other kinds, for bad input.
+    """
+    if not 0.0 <= limit_px <= MAX_LIMIT_PX:
+        raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
+    options = replace(options or AlignOptions(), tolerance_px=0.0)
+    start = perf_counter()
+    with _open(source, reference) as rasters:
+        count = len(rasters.ms.band_names) if per_band else 0
+        report = _part_of(progress, 0, count + 1)
+        alignment, misalignment = _examine(rasters, options, report, start)
+        bands = [
+            _check_band(
+                rasters,
+                replace(options, band=number),
+                limit_px,
+                _part_of(progress, number, count + 1),
+            )
+            for number in range(1, count + 1)
+        ]
+    return Check(
+        judge_misalignment(misalignment, limit_px),
+        limit_px,
+        misalignment,
+        is_affine_enough(misalignment, limit_px),
+        alignment,
+        tuple(bands) if per_band else None,
+    )
+
+
+def _check_band(
+    rasters: _Rasters,
+    options: AlignOptions,
+    limit_px: float,
+    progress: Progress | None,
+) -> BandCheck:
+    """One band by itself; a band that shows nothing spoils no other."""
+    assert options.band is not None
+    name = rasters.ms.band_names[options.band - 1]
+    try:
+        pair, solution = register(rasters.ms, rasters.pan, options, progress)
+    except (NoDataError, NoOverlapError) as error:
+        return BandCheck(options.band, name, CheckOutcome.CANNOT_TELL, reason=error.cause)
+    misalignment = measure_misalignment(pair, solution)
+    outcome = judge_misalignment(misalignment, limit_px)
+    alignment = _alignment(rasters, pair, solution)
+    return band_check((options.band, name), alignment, misalignment, limit_px, outcome)
+
+
+def _part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """Progress of one of several equal parts."""
+    if progress is None:
+        return None
+    show = progress
+    return lambda fraction, step: show((number + fraction) / count, step)
+
+
+def _examine(
+    rasters: _Rasters,
+    options: AlignOptions,
+    progress: Progress | None,
+    start: float,
+) -> tuple[Alignment, Misalignment]:
+    """Register two open rasters; `start` is when opening them began."""
+    ms, pan = rasters.ms, rasters.pan
+    if options.band:
+        check_band(ms, options.band)
+    check_band(pan, options.pan_band)
+    files = (*rasters.source_paths, rasters.reference_path)
+    prints = {path: fingerprint(path) for path in files}
+    opened = perf_counter() - start
+    pair, solution = register(ms, pan, options, progress)
+    alignment = _alignment(rasters, pair, solution)
+    notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
+    timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
+    alignment = replace(
+        alignment,
+        timings_s=timings,
+        warnings=alignment.warnings + notes,
+        extra={"fingerprints": prints},
+    )
+    return alignment, measure_misalignment(pair, solution)
+
+
+def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
     return Alignment(
         source=pair.source.grid,
         reference=pair.reference.grid,
-        source_paths=_paths(source),
-        reference_path=str(reference),
+        source_paths=rasters.source_paths,
+        reference_path=rasters.reference_path,
         correction=correction_of(pair, solution),
         tie_points=solution.tie_points,
         accuracy=solution.accuracy,
@@ -244,23 +381,3 @@ def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, .
         for gcp, (column, row) in ((gcp, to_own @ (gcp.column, gcp.row)) for gcp in gcps)
     )
     return replace(shared, original=own, corrected=corrected), moved
-
-
-def versions() -> dict[str, str]:
-    """Versions of everything that can change a result."""
-    import cv2
-    import pyproj
-    import rasterio
-
-    from geodelreg import __version__
-
-    return {
-        "geodelreg": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "opencv": cv2.__version__,
-        "rasterio": rasterio.__version__,
-        "gdal": rasterio.__gdal_version__,
-        "pyproj": pyproj.__version__,
-        "proj": pyproj.proj_version_str,
-    }

@@ -281,6 +281,34 @@ class Verdict:
         return self.outcome is not Outcome.REFUSED
 
 
+class CheckOutcome(Enum):
+    """What a check ended as."""
+
+    ALIGNED = "aligned"
+    MISALIGNED = "misaligned"
+    CANNOT_TELL = "cannot_tell"
+
+
+@dataclass(frozen=True, slots=True)
+class Misalignment:
+    """How far off MS lies, at the corner of the overlap where that is most; NaN = not known.
+
+    Attributes
+    ----------
+    distance_px, distance_m : float
+        In PAN pixels, and in metres on the ground.
+    sigma_px : float
+        Standard error of the distance, that of the worst corner.
+    local_px : float
+        RMS of smooth distortion that no affine transformation takes away, PAN pixels.
+    """
+
+    distance_px: float = float("nan")
+    distance_m: float = float("nan")
+    sigma_px: float = float("nan")
+    local_px: float = float("nan")
+
+
 @dataclass(frozen=True, slots=True)
 class Accuracy:
     """How good the fit is.  ``_px`` are PAN pixels, ``_m`` metres on the ground; NaN = not known.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ import click
 
 from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg_cli.console import configure_logging, log_steps, progress_bar
+from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
     GCP_FORMAT,
     SectionCommand,
@@ -20,12 +19,16 @@ from geodelreg_cli.options import (
     add_options,
     build,
     knob_option,
+    knob_options,
+    ms_and_pan,
+    run_options,
+    start_run,
 )
 
 if TYPE_CHECKING:
     from geodelreg.types import Alignment
 
-OUTPUT, CORRECTION, FORMAT, RUN = "Output", "How to align", "How OUT is written", "Run"
+OUTPUT, CORRECTION, FORMAT = "Output", "How to align", "How OUT is written"
 FILE = click.Path(path_type=Path)
 
 EPILOG = """\
@@ -79,8 +82,6 @@ def align_params() -> list[SectionOption]:
     def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
         return SectionOption(names, section=section, **kwargs)
 
-    write_knobs = [f.name for f in fields(WriteOptions) if f.name != "overwrite"]
-    align_knobs = [f.name for f in fields(AlignOptions) if f.name != "threads"]
     return [
         flag(
             "-o",
@@ -134,20 +135,9 @@ def align_params() -> list[SectionOption]:
             help="Draw the tie points on both images (needs the report extra).",
         ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
-        *(knob_option(AlignOptions, name, CORRECTION) for name in align_knobs),
-        *(knob_option(WriteOptions, name, FORMAT) for name in write_knobs),
-        knob_option(AlignOptions, "threads", RUN),
-        flag(
-            "--config",
-            nargs=2,
-            multiple=True,
-            metavar="KEY VALUE",
-            section=RUN,
-            help="Configuration option of GDAL. May be repeated.",
-        ),
-        flag("-q", "--quiet", is_flag=True, section=RUN, help="Print errors only."),
-        flag("-v", "--verbose", count=True, section=RUN, help="Print the steps; -vv everything."),
-        flag("--debug", is_flag=True, section=RUN, help="Print a traceback with an error."),
+        *knob_options(AlignOptions, CORRECTION, without=["threads"]),
+        *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
+        *run_options(),
     ]
 
 
@@ -162,24 +152,14 @@ def align(rasters: tuple[str, ...], **given: Any) -> None:
     systems may differ. OUT is MS with a corrected header: same pixels, same tags. An alignment
     that the images do not support is refused, and nothing is written.
     """
-    configure_logging(given["verbose"], given["quiet"], given["debug"])
-    _configure_gdal(given["config"])
+    start_run(given)
     request = _request(rasters, given)
     _check_outputs(request)
     _run(request)
 
 
-def _configure_gdal(pairs: tuple[tuple[str, str], ...]) -> None:
-    for key, value in pairs:
-        try:
-            os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
-        except ValueError as error:
-            raise click.UsageError(f"--config {key} {value}: {error}") from error
-
-
 def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
-    if len(rasters) < 2:
-        raise click.UsageError("Name at least two rasters: MS, then PAN.")
+    sources, reference = ms_and_pan(rasters)
     ways = [given["output"] is not None, given["in_place"], given["dry_run"]]
     if sum(ways) != 1:
         raise click.UsageError("Say where the result goes: one of -o OUT, --in-place, --dry-run.")
@@ -192,8 +172,8 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
     return Request(
-        sources=rasters[:-1],
-        reference=rasters[-1],
+        sources=sources,
+        reference=reference,
         output=given["output"],
         in_place=given["in_place"],
         dry_run=given["dry_run"],

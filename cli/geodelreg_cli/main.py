@@ -1,6 +1,7 @@
 """The ``geodelreg`` command: finds the subcommand, and turns every ending into an exit code.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage, 3 alignment refused, 130 Ctrl-C, 143 SIGTERM.
+Exit codes: 0 done, 1 failed, 2 wrong usage, 3 alignment refused, 4 misaligned (check), 130 Ctrl-C,
+143 SIGTERM.
 ``--help`` and ``--version`` load click and nothing else that is heavy: each subcommand is
 imported when it is called.
 """
@@ -22,6 +23,7 @@ from geodelreg_cli.interrupts import Terminated, termination_as_exception
 # name: (module that holds the click command of that name, line in the list of commands)
 COMMANDS = {
     "align": ("geodelreg_cli.align", "Correct the georeferencing of MS so that it fits PAN."),
+    "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
 }
@@ -32,6 +34,7 @@ Examples:
   geodelreg align ms.tif pan.tif -o aligned.tif
   geodelreg align ms.tif pan.tif --in-place
   geodelreg align B2.tif B3.tif B4.tif B8.tif -o aligned/
+  geodelreg check ms.tif pan.tif
   geodelreg align --help
 
 \b
@@ -39,7 +42,8 @@ Exit codes:
   0  done; also when MS already fits and its header is left as it is
   1  failed: an input cannot be read or an output cannot be written
   2  wrong usage
-  3  refused: the evidence supports no alignment, nothing was written
+  3  refused: the evidence supports no alignment, nothing was written; check: cannot tell
+  4  check: misaligned
 """
 
 

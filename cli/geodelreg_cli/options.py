@@ -7,16 +7,20 @@ there: ``search_radius_px`` is ``--search-radius PX``.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any, TypeVar
 
 import click
 
 from geodelreg.errors import UsageError
+from geodelreg.options import AlignOptions
+from geodelreg_cli.console import configure_logging
 
 _Options = TypeVar("_Options")
 
+RUN = "Run"
 UNITS = {"_px": "PX", "_deg": "DEG"}
 TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": click.BOOL}
 # Flags that GDAL's users know by another name than the knob's.
@@ -131,6 +135,63 @@ def _kind(field: Field[Any]) -> dict[str, Any]:
         "show_default": True,
         "metavar": unit,
     }
+
+
+def knob_options(options: type, section: str, without: Collection[str] = ()) -> list[SectionOption]:
+    """Click options of all knobs but some."""
+    names = [field.name for field in fields(options) if field.name not in without]
+    return [knob_option(options, name, section) for name in names]
+
+
+def run_options() -> list[SectionOption]:
+    """Options that every long-running command has: resources, GDAL's settings, messages."""
+    return [
+        knob_option(AlignOptions, "threads", RUN),
+        SectionOption(
+            ["--config"],
+            nargs=2,
+            multiple=True,
+            metavar="KEY VALUE",
+            section=RUN,
+            help="Configuration option of GDAL. May be repeated.",
+        ),
+        SectionOption(["-q", "--quiet"], is_flag=True, section=RUN, help="Print errors only."),
+        SectionOption(
+            ["-v", "--verbose"], count=True, section=RUN, help="Print the steps; -vv everything."
+        ),
+        SectionOption(
+            ["--debug"], is_flag=True, section=RUN, help="Print a traceback with an error."
+        ),
+    ]
+
+
+def start_run(given: Mapping[str, Any]) -> None:
+    """Put the values of `run_options` to work: messages, and GDAL's settings.
+
+    Raises
+    ------
+    click.UsageError
+        When a setting cannot be one.
+    """
+    configure_logging(given["verbose"], given["quiet"], given["debug"])
+    for key, value in given["config"]:
+        try:
+            os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
+        except ValueError as error:
+            raise click.UsageError(f"--config {key} {value}: {error}") from error
+
+
+def ms_and_pan(rasters: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    """Split the arguments ``MS... PAN``.
+
+    Raises
+    ------
+    click.UsageError
+        With fewer than two.
+    """
+    if len(rasters) < 2:
+        raise click.UsageError("Name at least two rasters: MS, then PAN.")
+    return rasters[:-1], rasters[-1]
 
 
 def add_options(options: Iterable[SectionOption]) -> Callable[[click.Command], click.Command]:

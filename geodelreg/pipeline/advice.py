@@ -9,7 +9,8 @@ from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import FloatArray
 
-_LOCAL_RMS_PX = 0.3
+LOCAL_RMS_PX = 0.3
+"""Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
 _LOCAL_SIGNIFICANCE = 3.0
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
@@ -33,7 +34,7 @@ def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
             "GDAL's pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
         )
     local = local_distortion(pair, solution)
-    if local > _LOCAL_RMS_PX:
+    if local > LOCAL_RMS_PX:
         notes.append(
             f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
             "(terrain, or bands that do not agree); a local warp would be needed"
@@ -45,11 +46,12 @@ def local_distortion(pair: Pair, solution: Solution) -> float:
     """RMS of what is left over smoothly, in PAN pixels; 0 when it is within the noise.
 
     Residuals are averaged over blocks; their variance beyond that of the noise is distortion.
+    NaN when there are too few tie points to tell.
     """
     points = solution.tie_points
     kept = points.kept
     if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK:
-        return 0.0
+        return float("nan")
     block = spatial_blocks(points.source_px[kept], _BLOCKS)
     residual = points.residual_px[kept]
     means, noise = [], []
@@ -59,7 +61,7 @@ def local_distortion(pair: Pair, solution: Solution) -> float:
             means.append(np.median(members, axis=0))
             noise.append(1.57 * members.var(axis=0, ddof=1) / len(members))
     if len(means) < _BLOCKS:
-        return 0.0
+        return float("nan")
     excess = np.mean(np.square(means), axis=0) - np.mean(noise, axis=0)
     doubt = _LOCAL_SIGNIFICANCE * np.mean(noise, axis=0) * np.sqrt(2 / len(means))
     return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))

@@ -119,3 +119,24 @@ def _numbers(values: Sequence[float]) -> str:
 
 def _rounded(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change a result."""
+    import platform
+
+    import cv2
+    import numpy
+    import pyproj
+    import rasterio
+
+    return {
+        "geodelreg": __version__,
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "opencv": cv2.__version__,
+        "rasterio": rasterio.__version__,
+        "gdal": rasterio.__gdal_version__,
+        "pyproj": pyproj.__version__,
+        "proj": pyproj.proj_version_str,
+    }

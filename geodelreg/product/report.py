@@ -17,7 +17,7 @@ from geodelreg.product.motion import HeaderMotion, header_motion
 from geodelreg.product.provenance import input_fingerprints, source_date
 from geodelreg.types import Alignment, Correction, Grid, Outcome, Status, TiePoints
 
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "1.1"
 
 
 def report_schema() -> dict[str, Any]:
@@ -29,7 +29,11 @@ def report_schema() -> dict[str, Any]:
 
 def report_json(alignment: Alignment, tie_points: bool = False) -> str:
     """`report_dict` as text: keys sorted, floats exact, unknown values null, no final newline."""
-    report = report_dict(alignment, tie_points)
+    return json_text(report_dict(alignment, tie_points))
+
+
+def json_text(report: Mapping[str, Any]) -> str:
+    """Text of a report: keys sorted, floats exact, no final newline."""
     return json.dumps(report, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
 
 
@@ -70,18 +74,17 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "timings_s": dict(alignment.timings_s),
         "versions": dict(alignment.versions),
     }
-    plain: dict[str, Any] = _plain(report)
-    return plain
+    return dict(plain(report))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Value made of JSON types alone; numbers that are not finite become None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -162,7 +165,7 @@ def summary_text(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.REFUSED:
         lines = _refused_lines(alignment)
     else:
-        lines = [_found_line(alignment), _accuracy_line(alignment), _next_line(alignment)]
+        lines = [_found_line(alignment), accuracy_line(alignment), _next_line(alignment)]
     return "\n".join(line for line in lines if line)
 
 
@@ -170,11 +173,11 @@ def _found_line(alignment: Alignment) -> str:
     motion = header_motion(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Already aligned: the header needs no correction and stays as it is."
-    off = _with_metres(motion.distance_px, motion.distance_m)
+    off = with_metres(motion.distance_px, motion.distance_m)
     (right, down), (width, height) = motion.shift_px, motion.scale
     parts = [
-        f"{_short(abs(right))} px {'right' if right >= 0 else 'left'}",
-        f"{_short(abs(down))} px {'down' if down >= 0 else 'up'}",
+        f"{short(abs(right))} px {'right' if right >= 0 else 'left'}",
+        f"{short(abs(down))} px {'down' if down >= 0 else 'up'}",
     ]
     if alignment.correction.model in ("scale", "similarity", "affine"):
         parts.append(f"scale × {width:.6f} by × {height:.6f}")
@@ -188,17 +191,18 @@ def _found_line(alignment: Alignment) -> str:
     )
 
 
-def _accuracy_line(alignment: Alignment) -> str:
+def accuracy_line(alignment: Alignment) -> str:
+    """How good the fit is, in one sentence."""
     accuracy = alignment.accuracy
     if not math.isfinite(accuracy.check_rmse_px):
         return f"{accuracy.kept} tie points; too few to measure the accuracy on points left out."
     text = (
         f"Accuracy at {accuracy.checked} check points: RMSE "
-        f"{_with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)}, CE90 "
-        f"{_with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m)}"
+        f"{with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)}, CE90 "
+        f"{with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m)}"
     )
     if math.isfinite(accuracy.before_rmse_px):
-        text += f"; before: {_short(accuracy.before_rmse_px)} PAN px"
+        text += f"; before: {short(accuracy.before_rmse_px)} PAN px"
     if math.isfinite(accuracy.coverage):
         text += f". They span {100 * accuracy.coverage:.0f} % of the overlap"
     return text + "."
@@ -232,11 +236,12 @@ def _refused_lines(alignment: Alignment) -> list[str]:
     ]
 
 
-def _with_metres(px: float, m: float) -> str:
-    return f"{_short(px)} PAN px" + (f" ({_short(m)} m)" if math.isfinite(m) else "")
+def with_metres(px: float, m: float) -> str:
+    """A length in PAN pixels, and in metres where these are known."""
+    return f"{short(px)} PAN px" + (f" ({short(m)} m)" if math.isfinite(m) else "")
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """Three significant digits without an exponent; "unknown" for NaN."""
     if not math.isfinite(value):
         return "unknown"

@@ -1,0 +1,137 @@
+"""``geodelreg check``: a verdict for scripts, nothing written."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from geodelreg.errors import AlignmentRefusedError
+from geodelreg.options import AlignOptions
+from geodelreg_cli.console import log_steps, progress_bar
+from geodelreg_cli.options import (
+    SectionCommand,
+    SectionOption,
+    add_options,
+    build,
+    knob_options,
+    ms_and_pan,
+    run_options,
+    start_run,
+)
+
+if TYPE_CHECKING:
+    from geodelreg.product.check import Check
+
+VERDICT, MEASUREMENT = "Verdict", "How to measure"
+MISALIGNED = 4
+
+EPILOG = """\
+Examples:
+
+  Is MS within half a PAN pixel of PAN?
+    geodelreg check ms.tif pan.tif
+
+  Stricter, and every band by itself:
+    geodelreg check ms.tif pan.tif --tolerance 0.2 --per-band
+
+  In a script:
+    geodelreg check ms.tif pan.tif -q || geodelreg align ms.tif pan.tif -o aligned.tif
+
+  One number:
+    geodelreg check ms.tif pan.tif --json | jq .check.misalignment.distance_px
+
+Exit codes: 0 aligned, 1 failed, 2 wrong usage, 3 cannot tell (the reason on stderr), 4 misaligned.
+"""
+
+
+def check_params() -> list[SectionOption]:
+    """Options of ``check``, in the order of the help."""
+    return [
+        SectionOption(
+            ["limit_px", "--tolerance"],
+            type=click.FloatRange(0.0, 1e6),
+            default="0.5",
+            show_default=True,
+            metavar="PX",
+            section=VERDICT,
+            help="Largest misalignment, anywhere in the overlap, that counts as aligned, in PAN "
+            "pixels. Beyond it by more than 3 standard errors is misaligned; when 3 standard "
+            "errors exceed PX, a raster that is not misaligned cannot be told to be aligned.",
+        ),
+        SectionOption(
+            ["--per-band"],
+            is_flag=True,
+            section=VERDICT,
+            help="Also match each MS band by itself; one misaligned band is misaligned (exit 4).",
+        ),
+        SectionOption(
+            ["--json"],
+            is_flag=True,
+            section=VERDICT,
+            help="Print the report on stdout in place of the text; its block is .check.",
+        ),
+        *knob_options(AlignOptions, MEASUREMENT, without=["threads", "tolerance_px"]),
+        *run_options(),
+    ]
+
+
+@add_options(check_params())
+@click.command(cls=SectionCommand, epilog=EPILOG)
+@click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
+def check(rasters: tuple[str, ...], **given: Any) -> int:
+    """Tell whether MS lies where PAN says, and write nothing.
+
+    MS is a multispectral raster, or several files with one band each; PAN, the last argument, is
+    the raster to compare with. The misalignment is the largest displacement in the overlap of the
+    two, with its standard error.
+    """
+    start_run(given)
+    sources, reference = ms_and_pan(rasters)
+    options = build(AlignOptions, given | {"tolerance_px": 0.0})
+    import geodelreg
+
+    with progress_bar(given["quiet"]) as bar:
+        found = geodelreg.check(
+            sources[0] if len(sources) == 1 else sources,
+            reference,
+            options,
+            limit_px=given["limit_px"],
+            per_band=given["per_band"],
+            progress=log_steps(bar),
+        )
+    _show(found, given)
+    return _exit_code(found)
+
+
+def _show(found: Check, given: dict[str, Any]) -> None:
+    """Warnings on stderr, then the report or the text on stdout."""
+    from geodelreg.product.check import check_json, check_text
+
+    for warning in found.alignment.warnings:
+        logging.getLogger(__name__).warning("warning: %s", warning)
+    if given["json"]:
+        click.echo(check_json(found))
+    elif not given["quiet"]:
+        click.echo(check_text(found))
+
+
+def _exit_code(found: Check) -> int:
+    """0 or 4.
+
+    Raises
+    ------
+    AlignmentRefusedError
+        When nothing can be told.
+    """
+    from geodelreg.types import CheckOutcome
+
+    if found.outcome is CheckOutcome.CANNOT_TELL:
+        raise AlignmentRefusedError(
+            f"cannot tell whether {found.source_name} is aligned: {found.reason}",
+            "Check that both show the same ground; try --band with the band that looks most like "
+            "PAN, a larger --search-radius, or a larger --tolerance.",
+            found.alignment,
+        )
+    return MISALIGNED if found.outcome is CheckOutcome.MISALIGNED else 0

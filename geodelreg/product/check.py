@@ -1,0 +1,219 @@
+"""The result of a check, for machines (a block of the report) and for people (a few lines)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from geodelreg.product.motion import header_motion
+from geodelreg.product.report import accuracy_line, json_text, plain, report_dict, short
+from geodelreg.types import Alignment, CheckOutcome, Misalignment
+
+_UNKNOWN = float("nan")
+_NOTHING_KNOWN = Misalignment()
+_WORDS = {
+    CheckOutcome.ALIGNED: "aligned",
+    CheckOutcome.MISALIGNED: "misaligned",
+    CheckOutcome.CANNOT_TELL: "cannot tell",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BandCheck:
+    """What one MS band, matched by itself, says.  NaN = not known.
+
+    Attributes
+    ----------
+    number : int
+        From 1.
+    name : str
+    outcome : CheckOutcome
+    misalignment : Misalignment
+    shift_px : (float, float)
+        How the band would have to move at its centre, along PAN columns and rows, PAN pixels.
+    sigma_px : float
+        Standard error of that shift.
+    correlation : float
+        With PAN, once moved.
+    reason : str
+        Why nothing can be told, or that it is misaligned locally; else empty.
+    """
+
+    number: int
+    name: str
+    outcome: CheckOutcome
+    misalignment: Misalignment = _NOTHING_KNOWN
+    shift_px: tuple[float, float] = (_UNKNOWN, _UNKNOWN)
+    sigma_px: float = _UNKNOWN
+    correlation: float = _UNKNOWN
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Check:
+    """Whether MS lies where PAN says.
+
+    Attributes
+    ----------
+    raster_outcome : CheckOutcome
+        Of the raster as a whole.
+    limit_px : float
+        Largest misalignment that counts as aligned, PAN pixels.
+    misalignment : Misalignment
+    affine_enough : bool or None
+        False when a local warp is needed; None when nothing can be told.
+    alignment : Alignment
+        The evidence; its correction is the measured one, however small.
+    bands : tuple of BandCheck or None
+        None when bands were not checked one by one.
+    """
+
+    raster_outcome: CheckOutcome
+    limit_px: float
+    misalignment: Misalignment
+    affine_enough: bool | None
+    alignment: Alignment
+    bands: tuple[BandCheck, ...] | None = None
+
+    @property
+    def source_name(self) -> str:
+        """File name of MS, and the number of further files."""
+        first, *others = self.alignment.source_paths
+        return Path(first).name + (f" and {len(others)} more" if others else "")
+
+    @property
+    def outcome(self) -> CheckOutcome:
+        """Misaligned when the raster or any of the checked bands is, else the raster's outcome."""
+        if any(band.outcome is CheckOutcome.MISALIGNED for band in self.bands or ()):
+            return CheckOutcome.MISALIGNED
+        return self.raster_outcome
+
+    @property
+    def reason(self) -> str:
+        """Why nothing can be told, or that the raster is misaligned locally; else empty."""
+        return explanation(self.raster_outcome, self.misalignment, self.alignment, self.limit_px)
+
+
+def explanation(
+    outcome: CheckOutcome, misalignment: Misalignment, alignment: Alignment, limit_px: float
+) -> str:
+    """What the figures do not show: why nothing can be told, or that the misalignment is local."""
+    if outcome is CheckOutcome.MISALIGNED and misalignment.local_px > limit_px:
+        return f"{short(misalignment.local_px)} PAN px RMS of local distortion"
+    if outcome is not CheckOutcome.CANNOT_TELL:
+        return ""
+    failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
+    return "; ".join(failed) or (
+        f"the standard error of {short(misalignment.sigma_px)} PAN px is too large for a tolerance "
+        f"of {limit_px:g} PAN px"
+    )
+
+
+def band_check(
+    band: tuple[int, str],
+    alignment: Alignment,
+    misalignment: Misalignment,
+    limit_px: float,
+    outcome: CheckOutcome,
+) -> BandCheck:
+    """Row of one band, given by number and name, out of its own alignment."""
+    reason = explanation(outcome, misalignment, alignment, limit_px)
+    if not alignment.verdict.accepted:
+        return BandCheck(*band, outcome, reason=reason)
+    return BandCheck(
+        *band, outcome, misalignment, header_motion(alignment).shift_px,
+        alignment.accuracy.sigma_centre_px, alignment.accuracy.ncc_after, reason,
+    )  # fmt: skip
+
+
+def check_json(check: Check) -> str:
+    """The report of the alignment as text, with the block ``check`` in it."""
+    return json_text(check_dict(check))
+
+
+def check_dict(check: Check) -> dict[str, Any]:
+    """`report_dict` of the alignment, with the block ``check`` in it."""
+    bands = check.bands
+    block = {
+        "outcome": check.outcome.value,
+        "raster_outcome": check.raster_outcome.value,
+        "limit_px": check.limit_px,
+        "reason": check.reason,
+        "misalignment": asdict(check.misalignment),
+        "affine_enough": check.affine_enough,
+        "bands": None if bands is None else [_band_dict(band) for band in bands],
+    }
+    return report_dict(check.alignment) | {"check": plain(block)}
+
+
+def _band_dict(band: BandCheck) -> dict[str, Any]:
+    return asdict(band) | {"outcome": band.outcome.value}
+
+
+def check_text(check: Check) -> str:
+    """A few lines for people: the verdict, what it rests on, and a table of the bands."""
+    lines = [_verdict_line(check)]
+    if check.alignment.verdict.accepted:
+        lines += [_motion_line(check), _local_line(check)]
+        lines.append(accuracy_line(check.alignment))
+    if check.bands is not None:
+        lines += ["", *_band_lines(check.bands)]
+    return "\n".join(lines)
+
+
+def _verdict_line(check: Check) -> str:
+    name = check.source_name
+    limit = f"tolerance {check.limit_px:g} PAN px"
+    if check.raster_outcome is CheckOutcome.CANNOT_TELL:
+        return f"{name}: cannot tell ({limit})"
+    off = check.misalignment
+    distance = f"{short(off.distance_px)} ± {short(off.sigma_px)} PAN px"
+    metres = f" ({short(off.distance_m)} m)" if math.isfinite(off.distance_m) else ""
+    if check.raster_outcome is CheckOutcome.MISALIGNED:
+        local = f", {check.reason}" if check.reason else ""
+        return f"{name}: misaligned by {distance}{metres} where it is most{local} ({limit})"
+    return f"{name}: aligned, off by {distance}{metres} where it is most ({limit})"
+
+
+def _motion_line(check: Check) -> str:
+    motion = header_motion(check.alignment)
+    (right, down), (width, height) = motion.shift_px, motion.scale
+    return (
+        f"To fit PAN, its centre would move {short(abs(right))} px "
+        f"{'right' if right >= 0 else 'left'}, {short(abs(down))} px "
+        f"{'down' if down >= 0 else 'up'}; rotation {motion.rotation_deg:.4f}°, "
+        f"scale × {width:.6f}, × {height:.6f} (model {check.alignment.correction.model})."
+    )
+
+
+def _local_line(check: Check) -> str:
+    if check.affine_enough is None:
+        return "Too few tie points to tell whether one affine is enough."
+    left = check.misalignment.local_px
+    local = f"{short(left)} PAN px RMS of smooth distortion" if left else "no smooth distortion"
+    if check.affine_enough:
+        return f"One affine is enough: it leaves {local}."
+    return f"One affine is not enough: it leaves {local}, a local warp is needed."
+
+
+def _band_lines(bands: tuple[BandCheck, ...]) -> list[str]:
+    """Table of the bands; dx and dy are the move of the centre in PAN pixels, as in the report."""
+    width = max(4, *(len(band.name) for band in bands))
+    lines = [
+        f"{'band':<{width}}  {'dx':>9}  {'dy':>9}  {'±':>7}  {'most':>9}  {'corr':>5}  verdict"
+    ]
+    for band in bands:
+        dx, dy = (_cell(value, "+.3f") for value in band.shift_px)
+        row = (
+            f"{band.name:<{width}}  {dx:>9}  {dy:>9}  {_cell(band.sigma_px, '.3f'):>7}  "
+            f"{_cell(band.misalignment.distance_px, '.3f'):>9}  "
+            f"{_cell(band.correlation, '.2f'):>5}  {_WORDS[band.outcome]}"
+        )
+        lines.append(row + (f": {band.reason}" if band.reason else ""))
+    return lines
+
+
+def _cell(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else "-"
