@@ -15,6 +15,7 @@ from geodelreg.geo.affine import affine_from_matrix, affine_matrix, apply_affine
 from geodelreg.types import FloatArray
 
 MODEL_ORDER = ("shift", "scale", "similarity", "affine")
+NORTH_UP = ("shift", "scale")
 PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}
 IDENTITY: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 

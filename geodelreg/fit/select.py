@@ -7,13 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit, weighted_fit
-from geodelreg.fit.models import MODEL_ORDER, Frame, transformation
+from geodelreg.fit.models import MODEL_ORDER, NORTH_UP, Frame, transformation
 from geodelreg.types import FloatArray, IntArray
 
 FOLDS = 5
 _BLOCKS = 8
 _SIGNIFICANT_T = 2.5
 _CAP_D2 = 25.0
+_NORTH_UP_LOSS = 0.04
+_LOSS = 0.01
+_LEAST_PREDICTED = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,16 +127,32 @@ def select_model(
         difference = estimate.transformation(corners) - full.transformation(corners)
         t_values[name] = _paired_t(check.distance2 - check_full.distance2, blocks)
         apart = float(np.abs(difference).max())
-        if t_values[name] < _SIGNIFICANT_T or apart < negligible_px:
+        if (
+            t_values[name] < _SIGNIFICANT_T
+            or apart < negligible_px
+            or _as_good(check, check_full, _NORTH_UP_LOSS if name in NORTH_UP else _LOSS)
+        ):
             estimate = robust_fit(name, points, frame)
             return Selection(estimate, held_out(name, points, estimate), t_values)
     return Selection(full, check_full, t_values)
 
 
+def _as_good(simple: HeldOut, full: HeldOut, loss: float) -> bool:
+    """True when the simpler model predicts held-out points as well, but for a small loss.
+
+    With many points a difference can be significant and of no use; a north-up raster is worth more
+    than a hundredth of the scatter of its tie points.
+    """
+    both = np.isfinite(simple.distance2) & np.isfinite(full.distance2)
+    if both.mean() < _LEAST_PREDICTED:
+        return False
+    return bool(simple.distance2[both].mean() <= (1 + loss) * full.distance2[both].mean())
+
+
 def _paired_t(difference: FloatArray, blocks: IntArray) -> float:
     """T of the mean of per-block means, blocks being the independent units."""
     good = np.isfinite(difference)
-    if good.mean() < 0.5:
+    if good.mean() < _LEAST_PREDICTED:
         return float("inf")
     number = np.bincount(blocks[good])
     total = np.bincount(blocks[good], weights=difference[good])

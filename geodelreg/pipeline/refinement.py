@@ -123,7 +123,7 @@ def _of_the_ground(
     if not _agree(part, ground, everything):
         return replace(ground, without_bright=True)
     sigma = _difference(part, ground.dense, everything.dense)[1]
-    return ground if sigma[0] < sigma[1] else everything
+    return ground if sigma[0] < _CLEARLY * sigma[1] else everything
 
 
 def _is_calm(dense: Dense) -> bool:
