@@ -73,13 +73,14 @@ class Pair:
 
     def ms_to_pan_px(self, points: FloatArray) -> FloatArray:
         """MS pixel positions (N, 2) in PAN pixels by the headers."""
-        x, y = _apply(self.ms_transform, points)
+        x, y = apply_transform(self.ms_transform, points)
         if self.ms_crs != self.pan_crs:
             x, y = Transformer.from_crs(self.ms_crs, self.pan_crs, always_xy=True).transform(x, y)
-        return np.stack(_apply(~self.pan_transform, np.stack([x, y], axis=1)), axis=1)
+        return np.stack(apply_transform(~self.pan_transform, np.stack([x, y], axis=1)), axis=1)
 
 
-def _apply(transform: Affine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def apply_transform(transform: Affine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """X and y of points (N, 2) through an affine."""
     a, b, c, d, e, f = tuple(transform)[:6]
     x, y = points[:, 0], points[:, 1]
     return a * x + b * y + c, d * x + e * y + f
@@ -158,8 +159,8 @@ def save_grid_correction(args: argparse.Namespace, pair: Pair, matrix: FloatArra
 def save_pixel_match(args: argparse.Namespace, pair: Pair, matrix: FloatArray) -> None:
     """Save a (2, 3) affine from MS pixels to PAN pixels as a geotransform in the MS CRS."""
     points = _fitting_points(pair.ms.shape[1:])
-    in_pan = np.stack(_apply(Affine(*matrix.ravel()), points), axis=1)
-    x, y = _apply(pair.pan_transform, in_pan)
+    in_pan = np.stack(apply_transform(Affine(*matrix.ravel()), points), axis=1)
+    x, y = apply_transform(pair.pan_transform, in_pan)
     if pair.ms_crs != pair.pan_crs:
         x, y = Transformer.from_crs(pair.pan_crs, pair.ms_crs, always_xy=True).transform(x, y)
     save(args, Affine(*fit_affine(points, np.stack([x, y], axis=1)).ravel()))

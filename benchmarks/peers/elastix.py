@@ -22,8 +22,8 @@ def main() -> None:
     parameters = itk.ParameterObject.New()
     stage = parameters.GetDefaultParameterMap("affine", 5)
     if args.setting == "best":
-        stage["NumberOfSpatialSamples"] = ["20000"]
-        stage["MaximumNumberOfIterations"] = ["1000"]
+        stage["NumberOfSpatialSamples"] = ["5000"]
+        stage["MaximumNumberOfIterations"] = ["500"]
         stage["FinalBSplineInterpolationOrder"] = ["3"]
     parameters.AddParameterMap(stage)
     _, found = itk.elastix_registration_method(
