@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -51,7 +52,10 @@ def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOpera
         source, target = CRS.from_wkt(from_wkt), CRS.from_wkt(to_wkt)
         if source.equals(target, ignore_axis_order=True):
             return None, CrsOperation()
-        group = TransformerGroup(source, target, always_xy=True)
+        with warnings.catch_warnings():
+            # about missing grids, which the result says in its own words
+            warnings.simplefilter("ignore", UserWarning)
+            group = TransformerGroup(source, target, always_xy=True)
         transformer = group.transformers[0]
     except (ProjError, IndexError) as error:
         raise CrsTransformError(

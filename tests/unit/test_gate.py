@@ -1,0 +1,133 @@
+"""The gate: every reason refuses by itself, and says what it measured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from geodelreg.fit import gate
+from geodelreg.fit.gate import Evidence, is_worthwhile, judge, log10_binomial_tail, verdict
+from geodelreg.options import AlignOptions
+from geodelreg.types import Outcome
+
+GOOD = Evidence(
+    points=100,
+    log_nfa=-200.0,
+    log_chance=-30.0,
+    coverage=0.8,
+    sigma_px=0.01,
+    disagreement_px=0.02,
+    rival=0.2,
+    shift_px=8.0,
+    rotation_deg=1.5,
+    scale=1.01,
+    rival_motion=0.0,
+    support=0.95,
+    bands_apart_px=0.1,
+)
+UPPER = {
+    "log_nfa": gate.MAX_LOG_NFA,
+    "log_chance": gate.MAX_LOG_NFA,
+    "sigma_px": gate.MAX_SIGMA_PX,
+    "disagreement_px": gate.MAX_DISAGREEMENT_PX,
+    "rival": gate.MAX_RIVAL,
+    "rival_motion": gate.MAX_RIVAL_MOTION,
+    "bands_apart_px": gate.MAX_BANDS_APART_PX,
+}
+LOWER = {
+    "points": gate.MIN_POINTS,
+    "coverage": gate.MIN_COVERAGE,
+    "support": gate.MIN_SUPPORT,
+}
+ASKED = {
+    "shift_px": AlignOptions(max_shift_px=9.0),
+    "rotation_deg": AlignOptions(max_rotation_deg=2.0),
+    "scale": AlignOptions(max_scale=1.05),
+}
+
+
+def outcome(evidence: Evidence, options: AlignOptions | None = None) -> Outcome:
+    return verdict(judge(evidence, options or AlignOptions()), moves=True).outcome
+
+
+def test_good_evidence_passes_every_reason() -> None:
+    reasons = judge(GOOD, AlignOptions())
+    assert all(reason.passed for reason in reasons)
+    assert len({reason.name for reason in reasons}) == len(reasons) == len(UPPER) + len(LOWER)
+    assert outcome(GOOD) is Outcome.ALIGNED
+    assert verdict(reasons, moves=False).outcome is Outcome.ALREADY_ALIGNED
+
+
+@pytest.mark.parametrize("name", [*UPPER, *LOWER])
+def test_each_reason_refuses_by_itself(name: str) -> None:
+    limit = {**UPPER, **LOWER}[name]
+    worse = 1 if name in UPPER else -1
+    step = worse * (1 if name == "points" else 1e-6)
+    assert outcome(replace(GOOD, **{name: limit})) is Outcome.ALIGNED
+    beyond = replace(GOOD, **{name: limit + step})
+    assert outcome(beyond) is Outcome.REFUSED
+    failed = [reason for reason in judge(beyond, AlignOptions()) if not reason.passed]
+    assert [(reason.value, reason.limit) for reason in failed] == [(limit + step, limit)]
+    assert f"{limit + step:.4g} " in failed[0].message
+    assert f"{limit:g}" in failed[0].message
+
+
+@pytest.mark.parametrize("name", [*UPPER, *LOWER])
+def test_what_was_not_measured_does_not_pass(name: str) -> None:
+    assert outcome(replace(GOOD, **{name: math.nan})) is Outcome.REFUSED
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_limits_that_were_asked_for_refuse(name: str) -> None:
+    far = replace(GOOD, **{name: 1000.0})
+    assert outcome(GOOD, ASKED[name]) is Outcome.ALIGNED
+    assert outcome(far, ASKED[name]) is Outcome.REFUSED
+    assert outcome(far) is Outcome.ALIGNED
+
+
+def test_nothing_found_is_a_refusal() -> None:
+    refused = verdict((gate.nothing_agrees(),), moves=True)
+    assert refused.outcome is Outcome.REFUSED
+    assert not refused.accepted
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(1, 3000), st.floats(0, 1), st.floats(0.02, 0.9))
+def test_binomial_tail_is_scipys(trials: int, share: float, probability: float) -> None:
+    """An upper bound, and a tight one where it counts."""
+    successes = round(share * trials)
+    exact = stats.binom.logsf(successes - 1, trials, probability) / math.log(10)
+    found = log10_binomial_tail(successes, trials, probability)
+    assert found <= 0
+    assert found >= exact - 1e-6 * max(1, abs(exact))
+    if -300 < exact < -4:
+        assert found == pytest.approx(exact, abs=0.15)
+
+
+def test_no_trials_prove_nothing() -> None:
+    assert log10_binomial_tail(0, 0, 0.25) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("move_px", "sigma_px", "moves"),
+    [
+        (0.0, 0.001, False),
+        (0.014, 0.001, False),
+        (0.018, 0.001, True),
+        (0.018, 0.02, False),
+        (0.03, 0.5, True),
+    ],
+    ids=["none", "within the systematic error", "significant", "insignificant", "large"],
+)
+def test_small_insignificant_corrections_are_not_worthwhile(
+    move_px: float, sigma_px: float, moves: bool
+) -> None:
+    move, sigma = np.zeros(25), np.full(25, sigma_px)
+    move[-1] = move_px
+    assert is_worthwhile(move, sigma, tolerance_px=0.02) is moves
