@@ -24,7 +24,7 @@ _TESTED_PATCHES = 160
 _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
 _RESEMBLES = 0.25
-_BANDS = 3
+_BANDS = 6
 _BAND_TILES = 8
 _SURE_SIGMAS = 3.0
 _RIVAL_TOLERANCE = 0.2
@@ -134,8 +134,8 @@ def bands_apart_px(
     Returns
     -------
     float
-        PAN pixels at the centre of the MS raster, of the two of the first three bands that are
-        furthest apart; 0 where fewer than two match.
+        PAN pixels at the centre of the MS raster, of the two bands that are furthest apart;
+        0 where fewer than two match.
     """
     pair = part.pair
     height, width = pair.source.grid.shape
@@ -143,7 +143,7 @@ def bands_apart_px(
     count = len(pair.source_bands)
     some = tiles[:: max(len(tiles) // _BAND_TILES, 1)]
     found = []
-    for band in range(min(count, _BANDS) if count > 1 else 0):
+    for band in _spread(count, _BANDS) if count > 1 else []:
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
         dense = match_pass(part, some, matrix, alone, RefineOptions(size=size), threads)
         if dense.estimate is not None:
@@ -155,6 +155,11 @@ def bands_apart_px(
         for (one, here), (other, there) in combinations(found, 2)
     ]
     return max([0.0, *apart])
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many indices, evenly spread from the first to the last."""
+    return [int(i) for i in np.linspace(0, count - 1, min(count, most)).round()]
 
 
 def rival_motion(points: TiePoints, unit_px: float) -> float:
