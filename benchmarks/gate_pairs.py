@@ -55,6 +55,7 @@ PROCEDURAL = {
     "fractal 1.6": HELD_OUT,
     "stripes": HELD_OUT,
 }
+UNFIT = {"landsat8_clouds"}  # its bands are 1.4 px apart on the clouds: no ground truth
 NEGATIVE = (
     "unrelated", "disjoint crops", "mirrored", "noise", "constant", "all cloud", "repeated",
     "changed", "beyond overlap",
@@ -141,9 +142,10 @@ def _makings(kind: str, part: str) -> list[tuple[str, str]]:
         return [(name, name) for name in real if name in LATER]
     if kind == "real pair":
         return [(n, n) for n in real if n in ("landsat8_momotombo", "landsat8_oman")]
-    if kind == "constant":
-        return [(name, name) for name in real]
-    return [(name, name) for name in real]
+    left_out = UNFIT if kind in POSITIVE else set()
+    if kind == "other CRS":
+        left_out = left_out | {"landsat_geographic"}
+    return [(name, name) for name in real if name not in left_out]
 
 
 @lru_cache(maxsize=16)
@@ -255,11 +257,10 @@ def _header_error(kind: str, rng: np.random.Generator) -> HeaderError:
 
 
 def _other_zone(imagery: Imagery) -> int:
-    """The neighbouring UTM zone; that of the place for geographic coordinates."""
+    """The neighbouring UTM zone."""
     from pyproj import CRS
 
-    epsg = CRS.from_wkt(imagery.crs_wkt).to_epsg() or 0
-    return epsg - 1 if epsg != 4326 else 32601 + int((imagery.transform.c + 180) // 6)
+    return (CRS.from_wkt(imagery.crs_wkt).to_epsg() or 0) - 1
 
 
 def textured_centre(
