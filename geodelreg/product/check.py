@@ -169,12 +169,19 @@ def _verdict_line(check: Check) -> str:
     if check.raster_outcome is CheckOutcome.CANNOT_TELL:
         return f"{name}: cannot tell ({limit})"
     off = check.misalignment
-    distance = f"{short(off.distance_px)} ± {short(off.sigma_px)} PAN px"
+    distance = f"{_with_sigma(off.distance_px, off.sigma_px)} PAN px"
     metres = f" ({short(off.distance_m)} m)" if math.isfinite(off.distance_m) else ""
     if check.raster_outcome is CheckOutcome.MISALIGNED:
         local = f", {check.reason}" if check.reason else ""
         return f"{name}: misaligned by {distance}{metres} where it is most{local} ({limit})"
-    return f"{name}: aligned, off by {distance}{metres} where it is most ({limit})"
+    more = ", not significantly more" if off.distance_px > check.limit_px else ""
+    return f"{name}: aligned, off by {distance}{metres} where it is most ({limit}{more})"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """``0.71 ± 0.05``: both with the decimals of the two leading digits of `sigma`."""
+    digits = min(max(1 - math.floor(math.log10(sigma)), 0), 4) if sigma > 0 else 4
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def _motion_line(check: Check) -> str:
