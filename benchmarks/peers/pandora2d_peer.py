@@ -13,6 +13,7 @@ from common import arguments, fit_affine, pan_on_ms_grid, read_pair, save_grid_c
 
 SEARCH_PX = 4
 ROUNDS = 5
+START = "from pandora2d.Pandora2d import main; main()"
 
 
 def _configuration(folder: Path, window: int) -> dict[str, object]:
@@ -56,7 +57,7 @@ def main() -> None:
     configuration.write_text(
         json.dumps(_configuration(folder, 11 if args.setting == "default" else 21))
     )
-    subprocess.run([str(Path(sys.executable).parent / "pandora2d"), str(configuration)], check=True)
+    subprocess.run([sys.executable, "-c", START, str(configuration)], check=True)
     maps = []
     for axis in ("col", "row"):
         with rasterio.open(next((folder / "result").rglob(f"{axis}_map.tif"))) as raster:
