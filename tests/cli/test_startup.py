@@ -23,7 +23,15 @@ def modules_after(statement: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "args", [["--version"], ["--help"], ["align", "--help"], ["gcps", "--help"], ["revert", "-h"]]
+    "args",
+    [
+        ["--version"],
+        ["--help"],
+        ["align", "--help"],
+        ["check", "--help"],
+        ["gcps", "--help"],
+        ["revert", "-h"],
+    ],
 )
 def test_help_and_version_load_nothing_heavy(args: list[str]) -> None:
     modules = modules_after(f"from geodelreg_cli.main import run; assert run({args!r}) == 0")
