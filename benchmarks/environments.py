@@ -94,7 +94,7 @@ def environment(peer: Peer, cache: Path) -> Path:
     """
     if peer.command and not shutil.which(peer.command):
         raise PeerUnavailableError(f"{peer.command} is not installed")
-    twin = next(p for p in PEERS if p.requirements == peer.requirements)
+    twin = next((p for p in PEERS if p.requirements == peer.requirements), peer)
     folder = cache / twin.script
     python, failure = folder / "bin" / "python", folder / "failure.txt"
     if failure.exists():
@@ -112,7 +112,8 @@ def environment(peer: Peer, cache: Path) -> Path:
 
 def _build(peer: Peer, folder: Path, python: Path) -> str:
     """Build; the reason when it fails, else ''."""
-    steps = [[peer.python or sys.executable, "-m", "venv", str(folder)]]
+    pip = [] if peer.requirements else ["--without-pip"]
+    steps = [[peer.python or sys.executable, "-m", "venv", *pip, str(folder)]]
     steps += [[str(python), "-m", "pip", "install", "-q", *step] for step in peer.requirements]
     steps.append([str(python), "-c", peer.probe])
     for step in steps:
