@@ -26,6 +26,10 @@ def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
         )
     if pair.mapping.operation.warning:
         notes.append(pair.mapping.operation.warning)
+    names = pair.source.band_names
+    left_out = [name for number, name in enumerate(names, 1) if number not in pair.source_bands]
+    if left_out and not pair.options.band:
+        notes.append(f"{', '.join(left_out)} of MS showed too little to be matched on")
     if solution.without_bright:
         notes.append("bright objects (clouds?) move differently from the ground and were left out")
     if solution.transformation.model in ("similarity", "affine"):

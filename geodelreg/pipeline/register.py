@@ -30,9 +30,11 @@ from geodelreg.pipeline.search import (
 from geodelreg.pipeline.solve import Solution, solve, unsolved
 from geodelreg.pipeline.state import Pair, Progress, make_pair
 from geodelreg.pipeline.tiles import roles
-from geodelreg.types import Correction, WindowReader
+from geodelreg.types import Band, Correction, WindowReader
 
 logger = logging.getLogger(__name__)
+
+_FAIR_SHARE = 0.5
 
 
 def register(
@@ -73,16 +75,16 @@ def register(
     refused: Solution | None = None
     looked = 0.0
     report(0.02, "reading")
-    for hypothesis in hypotheses(pair):
+    for seen, hypothesis in hypotheses(pair):
         report(0.4 + looked / 4, "refining")
         found = perf_counter() - start
         run = solve if options.method == "delaunay" else solve_baseline
-        solution = run(pair, hypothesis)
+        solution = run(seen, hypothesis)
         if solution is not None:
-            solution = _finish(pair, solution, found)
+            solution = _finish(seen, solution, found)
             if solution.verdict.accepted:
                 report(1.0, "done")
-                return pair, solution
+                return seen, solution
             refused = _better(refused, solution)
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
@@ -91,29 +93,53 @@ def register(
     return pair, refused
 
 
-def hypotheses(pair: Pair) -> Iterator[Hypothesis]:
-    """First guesses, the most likely first; later ones are only computed when needed."""
-    by_area: list[WorkingPair] = []
+def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
+    """First guesses, the most likely first; later ones are only computed when needed.
+
+    Yields
+    ------
+    pair : Pair
+        With the MS bands that show something where the guess was made.
+    hypothesis : Hypothesis
+    """
+    by_area: list[tuple[Pair, WorkingPair]] = []
     empty: NoDataError | None = None
     for scope in scopes(pair):
-        images = read_working_pair(pair, scope)
+        seen, images = _with_content(pair, read_working_pair(pair, scope))
         empty = _emptiness(images)
         if empty is not None:
             continue
         if not by_area:
-            by_area.append(images)
-        yield from keypoint_hypotheses(pair, images)
-    for images in by_area if pair.options.method == "delaunay" else []:
-        yield area_hypothesis(pair, images)
+            by_area.append((seen, images))
+        for hypothesis in keypoint_hypotheses(seen, images):
+            yield seen, hypothesis
+    for seen, images in by_area if pair.options.method == "delaunay" else []:
+        yield seen, area_hypothesis(seen, images)
     if empty is not None and not by_area:
         raise empty
 
 
+def _with_content(pair: Pair, images: WorkingPair) -> tuple[Pair, WorkingPair]:
+    """Without the MS bands that show much less than others: only common pixels are matched."""
+    shown = [int(band.valid.sum()) if _has_content(band) else 0 for band in images.source]
+    keep = [number for number, count in enumerate(shown) if count > _FAIR_SHARE * max(shown)]
+    if not keep or len(keep) == len(shown):
+        return pair, images
+    bands = tuple(pair.source_bands[number] for number in keep)
+    source = [images.source[number] for number in keep]
+    return replace(pair, source_bands=bands), replace(images, source=source)
+
+
+def _has_content(band: Band) -> bool:
+    values = band.data[band.valid]
+    return bool(values.size and values.min() < values.max())
+
+
 def _emptiness(images: WorkingPair) -> NoDataError | None:
-    for band in (*images.source[:1], images.reference):
-        values = band.data[band.valid]
-        if values.size == 0 or float(values.min()) == float(values.max()):
-            what = "no valid pixel" if values.size == 0 else f"the constant value {values[0]:g}"
+    for band in (images.source[0], images.reference):
+        if not _has_content(band):
+            values = band.data[band.valid]
+            what = f"the constant value {values[0]:g}" if values.size else "no valid pixel"
             return NoDataError(
                 f"{band.name} has {what} where the rasters overlap",
                 "Choose another band, or check the no-data value and the mask.",
