@@ -22,7 +22,7 @@ MAX_DISAGREEMENT_PX = 1.0
 MAX_RIVAL = 0.85
 MAX_RIVAL_MOTION = 0.67
 MIN_SUPPORT = 0.5
-MAX_BANDS_APART_PX = 1.0
+MAX_BANDS_APART = 0.5
 SYSTEMATIC_PX = 0.005
 SIGNIFICANCE = 3.0
 
@@ -54,8 +54,9 @@ class Evidence:
         Patches that agree on another motion over those that agree on the correction's.
     support : float
         Share of the areas that resemble the other image that do so best in place.
-    bands_apart_px : float
-        Between where two MS bands, each by itself, put the ground, beyond their standard errors.
+    bands_apart : float
+        Coarser pixels between where two MS bands, each by itself, put the ground, beyond their
+        standard errors.
     """
 
     points: int
@@ -70,7 +71,7 @@ class Evidence:
     scale: float
     rival_motion: float = 0.0
     support: float = 1.0
-    bands_apart_px: float = 0.0
+    bands_apart: float = 0.0
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -115,10 +116,10 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
             "support", evidence.support, MIN_SUPPORT, "share of the areas correlates best in place"
         ),
         _at_most(
-            "bands_apart_px",
-            evidence.bands_apart_px,
-            MAX_BANDS_APART_PX,
-            "PAN px between the places of two MS bands, as of clouds",
+            "bands_apart",
+            evidence.bands_apart,
+            MAX_BANDS_APART,
+            "coarser px between the places of two MS bands, as of clouds",
         ),
     ]
     if options.max_shift_px is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit
+from geodelreg.fit.models import Frame, Transformation
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan, single_band
 from geodelreg.match.consensus import consensus_affine, radial_residuals
@@ -206,13 +207,15 @@ def match_pass(
     observations = _observe(part, refined, matrix)
     status = refined.status.copy()
     status[~np.isfinite(observations.covariance).all(axis=(1, 2))] = Status.TEXTURE
-    return Dense(refined, observations, *_agreement(part, observations, status))
+    return Dense(refined, observations, *_agreement(part, observations, status, matrix))
 
 
 def _agreement(
-    part: Roles, points: Observations, status: StatusArray
+    part: Roles, points: Observations, status: StatusArray, matrix: FloatArray
 ) -> tuple[StatusArray, Estimate | None]:
-    """Robust fit of an affine (a shift where points are few) to the patches that agree.
+    """Robust fit of an affine to the patches that agree; where they are few, of a shift.
+
+    The shift is one of the current transformation, whose rotation and scale stay.
 
     A robust mean of two motions is neither: where the patches scatter beyond their own
     covariances, the motion that many of them share to within their noise is found first.
@@ -224,14 +227,27 @@ def _agreement(
         return status, None
     frame = part.pair.frame()
     unit = 1.0 if part.ms_is_template() else part.surface_px_per_template_px
+    if model == "shift":
+        estimate = _shifted(points.take(kept), matrix, frame)
+        status[kept[~estimate.inlier]] = Status.RESIDUAL
+        return status, estimate
     estimate = robust_fit(model, points.take(kept), frame)
-    if np.sqrt(estimate.extra_variance_px2) > _MIXED_SIGMA * unit and model == "affine":
+    if np.sqrt(estimate.extra_variance_px2) > _MIXED_SIGMA * unit:
         inliers = _rigid_core(points.take(kept), unit)
         status[kept[~inliers]] = Status.CONSENSUS
         kept = kept[inliers]
         estimate = robust_fit(model, points.take(kept), frame)
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     return status, estimate
+
+
+def _shifted(points: Observations, matrix: FloatArray, frame: Frame) -> Estimate:
+    """Robust shift on top of a transformation."""
+    there = Transformation("affine", matrix)(points.source)
+    estimate = robust_fit("shift", replace(points, source=there), frame)
+    moved = matrix.copy()
+    moved[:, 2] += estimate.transformation.matrix[:, 2]
+    return replace(estimate, transformation=Transformation("shift", moved))
 
 
 def _rigid_core(points: Observations, unit: float) -> BoolArray:

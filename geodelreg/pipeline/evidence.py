@@ -15,7 +15,7 @@ from geodelreg.match.refine import Patches, RefineOptions, cut_patches
 from geodelreg.match.surface import Surface, sample
 from geodelreg.pipeline.dense import Tuning, match_pass, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
-from geodelreg.types import Band, FloatArray, IntArray, TiePoints
+from geodelreg.types import Band, FloatArray, IntArray, Status, TiePoints
 
 _DISPLACED_RADII = (4.0, 9.0)
 _DIRECTIONS = 8
@@ -25,6 +25,7 @@ _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
 _RESEMBLES = 0.25
 _BANDS = 6
+_BAND_SHARE = 0.5
 _BAND_TILES = 8
 _SURE_SIGMAS = 3.0
 _RIVAL_TOLERANCE = 0.2
@@ -117,7 +118,7 @@ def best_in_place(scores: FloatArray) -> AreaEvidence:
     return AreaEvidence(len(best), int(best.sum()), int(alike.sum()), int((best & alike).sum()))
 
 
-def bands_apart_px(
+def bands_apart(
     part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int, threads: int
 ) -> float:
     """How far apart two bands put the ground by themselves, beyond their standard errors.
@@ -134,8 +135,8 @@ def bands_apart_px(
     Returns
     -------
     float
-        PAN pixels at the centre of the MS raster, of the two bands that are furthest apart;
-        0 where fewer than two match.
+        Coarser pixels at the centre of the MS raster, of the two bands that are furthest apart;
+        0 where fewer than two match as many patches as half of what the best one does.
     """
     pair = part.pair
     height, width = pair.source.grid.shape
@@ -147,14 +148,16 @@ def bands_apart_px(
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
         dense = match_pass(part, some, matrix, alone, RefineOptions(size=size), threads)
         if dense.estimate is not None:
-            place = pair.to_reference(dense.estimate.transformation.matrix, centre)[0]
-            sigma = float(dense.estimate.sigma_at(centre)[0]) * pair.pan_px_per_source_px
-            found.append((sigma, place))
+            place = dense.estimate.transformation(centre)[0]
+            kept = int((dense.status == Status.KEPT).sum())
+            found.append((kept, float(dense.estimate.sigma_at(centre)[0]), place))
+    enough = _BAND_SHARE * max((kept for kept, _, _ in found), default=0)
+    seen = [(sigma, place) for kept, sigma, place in found if kept >= enough]
     apart = [
         float(np.hypot(*(here - there))) - _SURE_SIGMAS * float(np.hypot(one, other))
-        for (one, here), (other, there) in combinations(found, 2)
+        for (one, here), (other, there) in combinations(seen, 2)
     ]
-    return max([0.0, *apart])
+    return max([0.0, *apart]) * min(1.0, pair.pan_px_per_source_px)
 
 
 def _spread(count: int, most: int) -> list[int]:

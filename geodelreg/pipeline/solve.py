@@ -22,7 +22,7 @@ from geodelreg.pipeline.dense import Dense, Tuning, surface_sigma
 from geodelreg.pipeline.evidence import (
     AreaEvidence,
     area_evidence,
-    bands_apart_px,
+    bands_apart,
     overlay,
     rival_motion,
 )
@@ -193,13 +193,13 @@ def conclude(
     area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
     if area.log_chance > _SURE_LOG_CHANCE:
         area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=False)
-    apart = bands_apart_px(
+    apart = bands_apart(
         part, refined.tiles, matrix, refined.tuning, refined.size, thread_count(pair)
     )
     evidence = replace(
         _evidence(pair, fitted, accuracy, area),
         rival=rival_correlation(after),
-        bands_apart_px=apart,
+        bands_apart=apart,
     )
     grid = pair.lattice()
     move = pair.to_reference(matrix, grid) - pair.to_reference(IDENTITY, grid)

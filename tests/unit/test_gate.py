@@ -29,7 +29,7 @@ GOOD = Evidence(
     scale=1.01,
     rival_motion=0.0,
     support=0.95,
-    bands_apart_px=0.1,
+    bands_apart=0.1,
 )
 UPPER = {
     "log_nfa": gate.MAX_LOG_NFA,
@@ -38,7 +38,7 @@ UPPER = {
     "disagreement_px": gate.MAX_DISAGREEMENT_PX,
     "rival": gate.MAX_RIVAL,
     "rival_motion": gate.MAX_RIVAL_MOTION,
-    "bands_apart_px": gate.MAX_BANDS_APART_PX,
+    "bands_apart": gate.MAX_BANDS_APART,
 }
 LOWER = {
     "points": gate.MIN_POINTS,

@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy import ndimage
 
-from geodelreg.fit.gate import MAX_BANDS_APART_PX, MAX_RIVAL, MAX_RIVAL_MOTION
+from geodelreg.fit.gate import MAX_BANDS_APART, MAX_RIVAL, MAX_RIVAL_MOTION
 from geodelreg.fit.models import IDENTITY
 from geodelreg.image.bright import bright_mask
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay, rival_correlation
+from geodelreg.match.refine import RefineOptions
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.dense import Tuning
+from geodelreg.pipeline.dense import Tuning, match_pass
 from geodelreg.pipeline.evidence import (
     AreaEvidence,
     area_evidence,
-    bands_apart_px,
+    bands_apart,
     best_in_place,
     rival_motion,
 )
@@ -132,7 +133,7 @@ def test_narrow_overlap_of_repeated_texture_still_has_a_rival() -> None:
 
 
 def two_bands(parallax_px: float) -> float:
-    """`bands_apart_px` where the second MS band sees everything displaced."""
+    """`bands_apart` where the second MS band sees everything displaced."""
     ground = texture(8, (200, 200))
     later = ndimage.shift(ground, (parallax_px, 0), order=3, mode="wrap").astype(np.float32)
     wkt = CRS.from_epsg(32616).to_wkt()
@@ -142,15 +143,39 @@ def two_bands(parallax_px: float) -> float:
     pair = make_pair(ms, ArrayReader((Band(ground, valid, grid),)), AlignOptions())
     part = roles(pair)
     tiles = read_tiles(part, [Window(0, 0, 200, 200)], IDENTITY, 1)
-    return bands_apart_px(part, tiles, IDENTITY, Tuning(0.5, single_band(2, 0)), 20, 1)
+    return bands_apart(part, tiles, IDENTITY, Tuning(0.5, single_band(2, 0)), 20, 1)
 
 
 def test_bands_of_clouds_are_apart() -> None:
-    assert two_bands(1.3) > MAX_BANDS_APART_PX
+    assert two_bands(1.3) > MAX_BANDS_APART
 
 
 def test_bands_of_the_ground_are_together() -> None:
     assert two_bands(0.0) < 0.01
+
+
+def test_few_patches_keep_the_rotation_they_start_from() -> None:
+    """A shift is fitted on top of the current transformation, not of the header."""
+    ground = texture(9, (160, 160))
+    turn, centre = np.radians(12.0), np.array([80.0, 80.0])
+    linear = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    truth = np.column_stack([linear, centre - linear @ centre])
+    x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(160) + 0.5)
+    there = np.stack([x.ravel(), y.ravel()], 1) @ linear.T + truth[:, 2] - 0.5
+    turned = ndimage.map_coordinates(ground, [there[:, 1], there[:, 0]], order=3, mode="mirror")
+    turned = turned.reshape(ground.shape).astype(np.float32)
+    wkt = CRS.from_epsg(32616).to_wkt()
+    grid = Grid(Affine(2.0, 0.0, 5e5, 0.0, -2.0, 1e6), ground.shape, wkt)
+    valid = np.ones(ground.shape, dtype=bool)
+    ms = ArrayReader((Band(turned, valid, grid),))
+    pair = make_pair(ms, ArrayReader((Band(ground, valid, grid),)), AlignOptions())
+    part, start = roles(pair), truth + np.array([[0.0, 0.0, 0.3], [0.0, 0.0, -0.2]])
+    tiles = read_tiles(part, [Window(50, 50, 60, 60)], start, 1)
+    tuning = Tuning(0.3, single_band(1, 0))
+    dense = match_pass(part, tiles, start, tuning, RefineOptions(size=20), 1)
+    assert len(dense.status) == 9
+    assert dense.estimate is not None
+    np.testing.assert_allclose(dense.estimate.transformation.matrix, truth, atol=0.03)
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 5.0])
