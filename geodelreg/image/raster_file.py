@@ -28,6 +28,9 @@ _PIECE_PIXELS = 2_000_000
 
 _LARGE_BLOCK_BYTES = 64_000_000
 
+_LARGEST = 1e15
+"""Larger values are fill that the header does not declare; their squares overflow."""
+
 
 class RasterFile:
     """A raster file that passed all checks.
@@ -208,7 +211,8 @@ def _validity(
     differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
     if raw.dtype.kind in "iu" and not masks and all(mask is None for mask in differing):
         return None
-    valid = np.isfinite(data)
+    with np.errstate(invalid="ignore"):
+        valid = np.abs(data) <= _LARGEST
     for plane, mask in [*enumerate(differing), *masks]:
         if mask is not None:
             valid[plane] &= mask

@@ -207,7 +207,7 @@ def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan
         return None
     stack = bands.astype(np.float64)
     low, high = np.percentile(stack, [0.2, 99.8], axis=1)
-    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), 1e-9)
+    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), 1e-30)
     curvature = np.zeros(len(bands) * (len(bands) + 1) // 2)
     if len(bands) <= _MAX_CURVED_BANDS:
         products = np.stack(list(_products(bands, centre, spread, low, high)), axis=1)

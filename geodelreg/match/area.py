@@ -60,7 +60,8 @@ def rival_correlation(overlay: Overlay) -> float:
     one, mask = _detail(overlay.template, overlay.valid, scale)
     other, _ = _detail(overlay.surface, overlay.valid, scale)
     height, width = one.shape
-    if min(height, width) < 4 * _NEAR_PX or mask.sum() < 1000:
+    small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
+    if small or mask.sum() < 1000:
         return float("nan")
     scores = _masked_correlation(one, mask, other, mask, _RIVAL_OVERLAP)
     middle_y, middle_x = height - 1, width - 1

@@ -21,6 +21,7 @@ from geodelreg.match.surface import Surface, sample_patches
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
 
 _MARGIN = 1
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,11 +240,11 @@ def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -
     normal, right, energy = gram[:, :3, :3], gram[:, :3, 3], gram[:, 3, 3]
     inverse, solvable = _inverted(normal)
     solution = np.einsum("pij,pj->pi", inverse, right)
-    solvable &= (total > 12) & (energy > 0) & (np.abs(solution[:, 0]) > 1e-9)
+    solvable &= (total > 12) & (energy > 0) & (solution[:, 0] ** 2 * gram[:, 0, 0] > 1e-9 * energy)
     gain = np.where(solvable, solution[:, 0], 1.0)
     residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
     variance = residual / np.maximum(total - 4, 1) / gain**2
-    together = np.sqrt(np.maximum(gram[:, 0, 0] * energy, 1e-12))
+    together = np.sqrt(np.maximum(gram[:, 0, 0] * energy, _TINY))
     return _step(
         solution[:, 1:] / gain[:, None],
         inverse[:, 1:, 1:] * variance[:, None, None],
@@ -266,7 +267,7 @@ def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _
     variance = residual / np.maximum(total - normal.shape[1] - 1, 1)
     by_bands, fine = _inverted(normal[:, 2:, 2:])
     explained = np.einsum("pi,pij,pj->p", right[:, 2:], by_bands, right[:, 2:])
-    correlation = np.sqrt(np.clip(explained / np.maximum(energy, 1e-12), 0, 1))
+    correlation = np.sqrt(np.clip(explained / np.maximum(energy, _TINY), 0, 1))
     return _step(
         -solution[:, :2], inverse[:, :2, :2] * variance[:, None, None], correlation, share,
         solvable & fine,
@@ -276,7 +277,7 @@ def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _
 def _inverted(normal: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Inverses of (P, k, k) normal matrices, and where they exist."""
     count = normal.shape[1]
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), 1e-12))
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), _TINY))
     outer = scale[:, :, None] * scale[:, None, :]
     scaled = normal / outer + np.eye(count) * 1e-9
     solvable = np.linalg.det(scaled) > 1e-6 ** (count / 3)

@@ -6,7 +6,7 @@ import numpy as np
 
 from geodelreg.fit.select import spatial_blocks
 from geodelreg.pipeline.solve import Solution
-from geodelreg.pipeline.state import Pair
+from geodelreg.pipeline.state import Pair, bands_asked
 from geodelreg.types import FloatArray
 
 LOCAL_RMS_PX = 0.3
@@ -26,9 +26,11 @@ def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
         )
     if pair.mapping.operation.warning:
         notes.append(pair.mapping.operation.warning)
-    names = pair.source.band_names
-    left_out = [name for number, name in enumerate(names, 1) if number not in pair.source_bands]
-    if left_out and not pair.options.band:
+    names, asked = pair.source.band_names, bands_asked(pair.source, pair.options)
+    if len(asked) < len(names) and not pair.options.band:
+        notes.append(f"{len(asked)} of {len(names)} bands of MS, evenly spread, were looked at")
+    left_out = [names[number - 1] for number in asked if number not in pair.source_bands]
+    if left_out:
         notes.append(f"{', '.join(left_out)} of MS showed too little to be matched on")
     if solution.without_bright:
         notes.append("bright objects (clouds?) move differently from the ground and were left out")

@@ -225,10 +225,10 @@ def _explained(
     image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
-    energy = np.maximum((image**2).sum(axis=(2, 3)), 1e-12)
+    energy = (image**2).sum(axis=(2, 3))
     good = seen.mean(axis=2) > _LEAST_SEEN
-    good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 1e-9)
-    return np.where(good, explained / energy, np.nan)
+    good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
+    return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
 
 
 def _centred(values: FloatArray, weight: FloatArray) -> FloatArray:

@@ -14,6 +14,9 @@ from geodelreg.geo.grid import gsd_px_m
 from geodelreg.options import AlignOptions
 from geodelreg.types import FloatArray, WindowReader
 
+MOST_BANDS = 12
+"""Bands of a hyperspectral image that are matched on at most."""
+
 Progress = Callable[[float, str], None]
 
 
@@ -108,6 +111,15 @@ class Pair:
         return local[:, :, 2], covariance
 
 
+def bands_asked(source: WindowReader, options: AlignOptions) -> tuple[int, ...]:
+    """MS bands to look at, from 1: the one asked for, or all, or as many as help, evenly spread."""
+    count = len(source.band_names)
+    if options.band:
+        return (options.band,)
+    spread = np.linspace(1, count, min(count, MOST_BANDS)).round()
+    return tuple(int(number) for number in spread)
+
+
 def make_pair(source: WindowReader, reference: WindowReader, options: AlignOptions) -> Pair:
     """Relate two rasters by their headers.
 
@@ -116,11 +128,10 @@ def make_pair(source: WindowReader, reference: WindowReader, options: AlignOptio
     CrsTransformError
         If PROJ knows no operation between the CRSs.
     """
-    bands = (options.band,) if options.band else tuple(range(1, len(source.band_names) + 1))
     return Pair(
         source,
         reference,
-        bands,
+        bands_asked(source, options),
         header_mapping(source.grid, reference.grid),
         gsd_px_m(source.grid),
         gsd_px_m(reference.grid),

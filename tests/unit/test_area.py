@@ -105,3 +105,10 @@ def test_rivals_are_unknown_without_enough_to_look_at() -> None:
     nothing = np.zeros((SIZE, SIZE), bool)
     square = image[:SIZE, :SIZE]
     assert math.isnan(rival_correlation(overlay(square, square, nothing, nothing)))
+
+
+def test_narrow_strips_are_looked_at_along_their_length() -> None:
+    noise = np.random.default_rng(9).normal(0, 10, (160, 24))
+    strip, repeated = texture(8)[:160, :24], np.tile(texture(8)[:40, :24], (4, 1))
+    assert rival_correlation(overlay(strip, strip + noise)) < 0.6
+    assert rival_correlation(overlay(repeated, repeated + noise)) > 0.9

@@ -1,0 +1,134 @@
+"""What the pixels hold does not matter: units, types, undeclared fill, few or many bands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+
+from geodelreg import align
+from geodelreg.pipeline.state import MOST_BANDS
+from geodelreg.types import Outcome
+from tests.integration.align_scenes import Pixels, Recipe, Scene, centred, make_scene, write
+
+STANDARD = Recipe(centred(4, 130), (130, 130))
+Change = Callable[[Pixels], NDArray[np.generic]]
+
+
+@pytest.fixture(scope="module")
+def standard(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return make_scene(tmp_path_factory.mktemp("standard"), STANDARD)
+
+
+def changed(path: Path, folder: Path, change: Change, nodata: int | None = None) -> Path:
+    with rasterio.open(path) as dataset:
+        data, transform, crs = dataset.read(), dataset.transform, dataset.crs.to_wkt()
+    return write(folder / path.name, change(data), transform, crs, nodata)
+
+
+def same(data: Pixels) -> Pixels:
+    return data
+
+
+def tiny(data: Pixels) -> NDArray[np.generic]:
+    """As night lights are, in W/cm²/sr."""
+    return data * 1e-12
+
+
+def huge(data: Pixels) -> NDArray[np.generic]:
+    return data * 1e9
+
+
+def negative(data: Pixels) -> NDArray[np.generic]:
+    return (data.astype(np.int32) - 3000).astype(np.int16)
+
+
+def eight_bit(data: Pixels) -> NDArray[np.generic]:
+    return (data // 16).astype(np.uint8)
+
+
+def filled(data: Pixels) -> NDArray[np.generic]:
+    """Fill values that the header does not declare, NaN and infinity."""
+    out = data.astype(np.float32)
+    side = data.shape[1]
+    out[:, : side // 10] = np.finfo(np.float32).min
+    out[:, :, -side // 10 :] = 3e38
+    out[:, side // 2, side // 3], out[:, side // 3, side // 2] = np.nan, np.inf
+    return out
+
+
+@pytest.mark.parametrize(
+    ("of_ms", "of_pan"),
+    [(tiny, tiny), (tiny, same), (same, tiny), (huge, same), (negative, eight_bit),
+     (filled, filled), (filled, same)],
+    ids=lambda change: change.__name__,
+)  # fmt: skip
+def test_values_of_any_size_are_matched(
+    standard: Scene, tmp_path: Path, of_ms: Change, of_pan: Change
+) -> None:
+    ms, pan = (changed(p, tmp_path, c) for p, c in ((standard.ms, of_ms), (standard.pan, of_pan)))
+    alignment = align(ms, pan)
+    assert alignment.verdict.outcome is Outcome.ALIGNED
+    assert standard.rmse_px(alignment.correction.corrected) < 0.02
+
+
+def test_a_narrow_strip_is_enough(tmp_path: Path) -> None:
+    """As the overlap of neighbouring swaths is."""
+    place = Affine.translation(330, 100) @ Affine.scale(4)
+    scene = make_scene(tmp_path, Recipe(place, (150, 26)))
+    alignment = align(scene.ms, scene.pan)
+    assert scene.rmse_px(alignment.correction.corrected) < 0.03
+
+
+def test_of_very_many_bands_some_are_matched(standard: Scene, tmp_path: Path) -> None:
+    """As a hyperspectral image has, some of them empty."""
+    rng = np.random.default_rng(0)
+
+    def many(data: Pixels) -> NDArray[np.generic]:
+        weights = rng.dirichlet(np.ones(4), 90)
+        bands = np.tensordot(weights, data.astype(np.float64), axes=1)
+        bands[::7] = 0
+        return (bands + rng.normal(0, 3, bands.shape)).clip(0).astype(np.uint16) * (bands > 0)
+
+    ms = changed(standard.ms, tmp_path, many, 0)
+    alignment = align(ms, standard.pan)
+    assert standard.rmse_px(alignment.correction.corrected) < 0.1
+    assert MOST_BANDS / 2 < len(alignment.band_weights) <= MOST_BANDS
+    assert any("of 90 bands" in warning for warning in alignment.warnings)
+
+
+def test_one_band_is_enough(standard: Scene, tmp_path: Path) -> None:
+    alignment = align(changed(standard.ms, tmp_path, lambda data: data[1:2]), standard.pan)
+    assert standard.rmse_px(alignment.correction.corrected) < 0.1
+    assert list(alignment.band_weights) == ["band 1"]
+
+
+def test_a_raster_lies_on_itself(standard: Scene) -> None:
+    alignment = align(standard.pan, standard.pan)
+    assert alignment.verdict.outcome is Outcome.ALREADY_ALIGNED
+    assert alignment.accuracy.before_rmse_px < 0.001
+
+
+def test_inverted_contrast_is_aligned(standard: Scene, tmp_path: Path) -> None:
+    """Near infrared against PAN over land and water, say."""
+    ms = changed(standard.ms, tmp_path, lambda data: 4095 - data)
+    alignment = align(ms, standard.pan)
+    assert standard.rmse_px(alignment.correction.corrected) < 0.1
+
+
+def test_undeclared_frames_do_not_lead(tmp_path: Path) -> None:
+    """A black frame at the same pixels of both images is an edge that never moves."""
+
+    def frame(ms: Pixels, pan: Pixels) -> None:
+        ms[:, :20], ms[:, :, -20:] = 0, 0
+        pan[:80], pan[:, -80:] = 0, 0
+
+    scene = make_scene(tmp_path, replace(STANDARD, change=frame))
+    alignment = align(scene.ms, scene.pan)
+    assert scene.rmse_px(alignment.correction.corrected) < 0.05
