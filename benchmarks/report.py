@@ -38,10 +38,11 @@ def replace_section(page: Path, name: str, text: str) -> None:
 
 
 def machine() -> str:
-    """Processor and interpreter, for the caption of a table."""
+    """Processor, interpreter, and how busy others keep it, for the caption of a table."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = names[0].split(":", 1)[1].strip() if names else model
-    return f"{os.cpu_count()} cores, {model}, Python {platform.python_version()}"
+    load = f"load {os.getloadavg()[0]:.1f}"
+    return f"{os.cpu_count()} cores, {model}, Python {platform.python_version()}, {load}"

@@ -1,7 +1,8 @@
 """AROSICS: one global shift (default), or its local tie points and an affine through them (best).
 
 Written for GDAL 3.6, which AROSICS needs two small additions to.  Its environment has Debian's GDAL
-and no rasterio, so the geotransform is read from AROSICS itself.
+and no rasterio, so the geotransform is read from AROSICS itself.  Footprints of the valid pixels
+are not computed (`calc_corners`): with GDAL 3.6 their GeoJSON cannot be parsed on ragged no-data.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from osgeo import gdal
+from osgeo import gdal, ogr
 
 GREEN_BAND = 2
 MAX_SHIFT_MS_PX = 20
+FEWEST_POINTS = 6
 
 
 @contextlib.contextmanager
@@ -34,15 +36,18 @@ def _config_options(options: dict[str, str], thread_local: bool = True) -> Itera
 def _extend_gdal() -> None:
     if not hasattr(gdal, "config_options"):
         gdal.config_options = _config_options
-    if not hasattr(gdal.Dataset, "__enter__"):
-        gdal.Dataset.__enter__ = lambda self: self
-        gdal.Dataset.__exit__ = lambda self, *error: None
+    for handle in (gdal.Dataset, ogr.DataSource):
+        if not hasattr(handle, "__enter__"):
+            handle.__enter__ = lambda self: self
+            handle.__exit__ = lambda self, *error: None
 
 
 def _global(ms: str, pan: str) -> list[float]:
     from arosics import COREG
 
-    found = COREG(pan, ms, max_shift=MAX_SHIFT_MS_PX, s_b4match=GREEN_BAND, q=True)
+    found = COREG(
+        pan, ms, max_shift=MAX_SHIFT_MS_PX, s_b4match=GREEN_BAND, calc_corners=False, q=True
+    )
     found.calculate_spatial_shifts()
     if not found.success:
         raise SystemExit("AROSICS reports no success")
@@ -55,11 +60,13 @@ def _local(ms: str, pan: str) -> list[float]:
 
     found = COREG_LOCAL(
         pan, ms, grid_res=24, window_size=(64, 64), max_shift=MAX_SHIFT_MS_PX,
-        s_b4match=GREEN_BAND, q=True, CPUs=2,
+        s_b4match=GREEN_BAND, calc_corners=False, q=True, CPUs=2,
     )  # fmt: skip
     found.calculate_spatial_shifts()
     table = found.CoRegPoints_table
     table = table[(table["ABS_SHIFT"] != -9999) & (table["OUTLIER"] == False)]  # noqa: E712
+    if len(table) < FEWEST_POINTS:
+        raise SystemExit(f"{len(table)} tie points, too few for an affine")
     header = gdal.Open(ms).GetGeoTransform()
     place = table[["X_MAP", "Y_MAP"]].to_numpy(float)
     true = place + table[["X_SHIFT_M", "Y_SHIFT_M"]].to_numpy(float)
