@@ -21,7 +21,7 @@ from geodelreg.match.surface import Surface, sample_patches
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
 
 _MARGIN = 1
-_TINY = float(np.finfo(np.float64).tiny)
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -
     gain = np.where(solvable, solution[:, 0], 1.0)
     residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
     variance = residual / np.maximum(total - 4, 1) / gain**2
-    together = np.sqrt(np.maximum(gram[:, 0, 0] * energy, _TINY))
+    together = np.sqrt(np.maximum(gram[:, 0, 0], _TINY) * np.maximum(energy, _TINY))
     return _step(
         solution[:, 1:] / gain[:, None],
         inverse[:, 1:, 1:] * variance[:, None, None],

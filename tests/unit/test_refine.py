@@ -183,6 +183,21 @@ def test_flat_patches_have_no_texture() -> None:
     assert (found.status == Status.TEXTURE).all()
 
 
+def test_empty_patches_cause_no_arithmetic_noise() -> None:
+    """Neither do values so small that their squares vanish."""
+    field = waves(7)
+    template, image = seen_by_template(field), seen_by_surface(field)
+    nothing = np.zeros_like(template)
+    with np.errstate(all="raise", under="ignore"):
+        found, _ = match(patches_of(nothing, nothing), image)
+        assert (found.status == Status.TEXTURE).all()
+        found, _ = match(patches_of(template), np.zeros_like(image))
+        assert (found.status == Status.TEXTURE).all()
+        found, moved = match(patches_of(1e-11 * template), 1e-13 * image)
+    assert (found.status == Status.KEPT).all()
+    assert np.abs(moved).max() < 0.003
+
+
 def test_an_edge_alone_does_not_place_a_patch() -> None:
     """Along the edge nothing holds it (the aperture problem)."""
     rng = np.random.default_rng(0)
