@@ -21,8 +21,8 @@ CAVEATS = """How to read it:
 - Phase correlation and global AROSICS estimate a shift only; most peers are made for headers that
   are a few pixels off and nearly unrotated, so C is outside what they promise.
 - An affine through AROSICS's, pandora2d's and Orfeo ToolBox's points is the adapter's, not theirs.
-- G has bright clouds that move by 6 and 9 px between the images; what is 5 to 9 px off follows them,
-  or moved nothing."""
+- G has bright clouds that move by 6 and 9 px between the images; what is 5 to 9 px off follows
+  them, or moved nothing."""
 NOISE_FLOOR = {"rmse_px": 0.002, "wall_s": 0.3, "peak_mb": 20.0}
 Results = list[dict[str, Any]]
 
@@ -84,7 +84,7 @@ def plot(results: Results, path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(8, 5.5))
+    figure, axes = plt.subplots(figsize=(9.5, 5.5))
     tools = list(dict.fromkeys(result["tool"] for result in results))
     for index, tool in enumerate(tools):
         part = [result for result in results if result["tool"] == tool]
@@ -96,7 +96,7 @@ def plot(results: Results, path: Path) -> None:
     axes.axhline(3.0, color="0.6", linewidth=0.8, linestyle=":")
     axes.text(axes.get_xlim()[0], 3.2, " failed, or more than 1 px off", fontsize=8, color="0.4")
     axes.set(xscale="log", yscale="log", xlabel="wall time, s", ylabel="RMSE, PAN px")
-    axes.legend(fontsize=8, loc="center right")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5))
     axes.grid(alpha=0.3)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
