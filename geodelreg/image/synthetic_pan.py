@@ -10,6 +10,7 @@ import numpy as np
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray
 
 _ROUNDS = 12
+_SLICE = 512
 _TUKEY = 3.0
 _TUKEY_WIDE = 4.0
 _MAX_CURVED_BANDS = 6
@@ -93,21 +94,27 @@ def _unremarkable(x: FloatArray) -> FloatArray:
 
 def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatArray, float, float]:
     """Weights, correlation and robust spread of the residuals, from a first trust in pixels."""
+    rows = np.vstack([x, y])
+    rows -= rows.mean(axis=1, keepdims=True)
+    floor = 1e-3 * float(rows[-1].std()) + 1e-30
     trust = start
     weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
     for round_number in range(_ROUNDS):
         total = max(float(trust.sum()), 1e-30)
-        x0 = x - (x * trust).sum(axis=1, keepdims=True) / total
-        y0 = y - float((y * trust).sum()) / total
-        gram, moment = (x0 * trust) @ x0.T, (x0 * trust) @ y0
+        trusted = rows * trust
+        mean = trusted.sum(axis=1) / total
+        # einsum, for BLAS would wake its threads for products as thin as these
+        second = np.einsum("bn,cn->bc", trusted, rows) - total * np.multiply.outer(mean, mean)
+        gram, moment, power = second[:-1, :-1], second[:-1, -1], float(second[-1, -1])
         weights = non_negative_weights(gram, moment)
         energy = float(weights @ gram @ weights)
-        if energy <= 0:
+        if energy <= 0 or power <= 0:
             return np.zeros(len(x)), 0.0, np.inf
-        correlation = float(weights @ moment) / np.sqrt(energy * float((trust * y0) @ y0))
-        residual = np.abs(y0 - weights @ x0)
+        correlation = float(weights @ moment) / np.sqrt(energy * power)
+        constant = float(mean[-1] - weights @ mean[:-1])
+        residual = np.abs(rows[-1] - np.einsum("b,bn->n", weights, rows[:-1]) - constant)
         if round_number < _ROUNDS // 2:
-            trust = start / np.maximum(residual, 1e-3 * float(y0.std()) + 1e-30)
+            trust = start / np.maximum(residual, floor)
             scale = _MAD_TO_SIGMA * float(np.median(residual))
             continue
         scale = min(scale, _MAD_TO_SIGMA * float(np.median(residual)))
@@ -275,9 +282,13 @@ def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
     fitted: FloatArray = np.zeros(design.shape[1])
     for _ in range(6):
         weighted = design * trust[:, None]
-        normal = np.asarray(weighted.T @ design + ridge)
-        fitted = np.asarray(np.linalg.solve(normal, weighted.T @ target), dtype=np.float64)
-        residual = target - design @ fitted
+        normal = ridge + sum(
+            weighted[start : start + _SLICE].T @ design[start : start + _SLICE]
+            for start in range(0, len(target), _SLICE)
+        )
+        moment = np.einsum("nk,n->k", weighted, target)
+        fitted = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
+        residual = target - np.einsum("nk,k->n", design, fitted)
         scale = _robust_spread(residual)
         trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + 1e-30)) ** 2, 0, None) ** 2
     return fitted
