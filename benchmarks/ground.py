@@ -13,6 +13,8 @@ from benchmarks.imagery import Float32Array, Imagery
 FloatArray = NDArray[np.float64]
 FULL_SCALE_COUNTS = 3000.0
 FULL_SCALE_PERCENTILE = 99.8
+SHADOW_STEP = (38, -52)
+"""Rows and columns from a cloud to its shadow, PAN pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,16 +139,19 @@ class CloudLayer:
         0 to 1, as PAN sees it.
     radiance : (H, W) float32
         In counts.
+    shadow : (H, W) float32
+        Opacity as it falls on the ground, where it stays.
     shift_px : tuple of float
         MS position minus PAN position, ``(column, row)``, in PAN pixels.
     """
 
     opacity: Float32Array
     radiance: Float32Array
+    shadow: Float32Array
     shift_px: tuple[float, float]
 
     def moved(self) -> CloudLayer:
-        """The layer as MS sees it."""
+        """The layer as MS sees it; both images are of one moment, so its shadow has not moved."""
         from scipy import ndimage
 
         step = (self.shift_px[1], self.shift_px[0])
@@ -163,15 +168,15 @@ def cloud_layer(
     level = np.quantile(noise[::4, ::4], 1.0 - cover)
     opacity = np.clip((noise - level) / 0.25 + 0.5, 0, 1).astype(np.float32)
     radiance = 3000.0 + 350.0 * fractal(shape, 1.2, rng)
-    return CloudLayer(opacity, np.clip(radiance, 1800, 3900).astype(np.float32), shift_px)
+    radiance = np.clip(radiance, 1800, 3900).astype(np.float32)
+    return CloudLayer(opacity, radiance, np.roll(opacity, SHADOW_STEP, axis=(0, 1)), shift_px)
 
 
 def cover_with(ground: Ground, layers: list[CloudLayer]) -> Ground:
     """The ground under clouds and their shadows; shadows stay where they fall."""
     bands = ground.bands.copy()
     for layer in layers:
-        shade = 1.0 - 0.45 * np.roll(layer.opacity, (38, -52), axis=(0, 1))
-        bands *= shade
+        bands *= 1.0 - 0.45 * layer.shadow
     for layer in layers:
         bands += layer.opacity * (layer.radiance - bands)
     return replace(ground, bands=bands)

@@ -11,6 +11,7 @@ from affine import Affine
 from pyproj import CRS, Transformer
 from scipy import ndimage
 
+from benchmarks.ground import Ground, cloud_layer, cover_with
 from benchmarks.imagery import Imagery
 from benchmarks.measure import MeasureOptions, Raster, measure_offsets
 from benchmarks.scenes import HeaderError, Scene, SceneSpec, make_scene, write_scene
@@ -212,3 +213,12 @@ def test_clouds_move_but_the_ground_does_not() -> None:
     offsets = measure_offsets(ms, pan, MeasureOptions(window_px=24, stride_px=8))
     assert len(offsets.score) >= 5
     assert offsets.distance_px < 0.15
+
+
+def test_shadows_stay_on_the_ground_while_their_clouds_move() -> None:
+    plain = Ground(np.full((1, 200, 220), 1000.0, np.float32), (0, 0), (200, 220))
+    layer = cloud_layer((200, 220), 0.1, (9.0, -6.0), np.random.default_rng(3))
+    before, after = (cover_with(plain, [seen]).bands[0] for seen in (layer, layer.moved()))
+    in_sight = (layer.opacity == 0) & (layer.moved().opacity == 0)
+    assert before[in_sight].min() < 600
+    np.testing.assert_array_equal(after[in_sight], before[in_sight])
