@@ -178,6 +178,9 @@ def half_disagreement(points: Observations, estimate: Estimate, corners: FloatAr
     block = spatial_blocks(points.source)
     white = (block % _BLOCKS + block // _BLOCKS) % 2 == 0
     if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
+        # a few points may all lie on one colour: then every other one of them, row by row
+        white = np.argsort(np.argsort(block, kind="stable")) % 2 == 0
+    if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
         return float("inf")
     weight = np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
     ends = []

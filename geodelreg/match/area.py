@@ -57,13 +57,14 @@ def rival_correlation(overlay: Overlay) -> float:
         NaN when the overlay is too small or has no texture.
     """
     scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
-    one, mask = _detail(overlay.template, overlay.valid, scale)
-    other, _ = _detail(overlay.surface, overlay.valid, scale)
+    one, one_mask = _detail(overlay.template, overlay.template_valid, scale)
+    other, other_mask = _detail(overlay.surface, overlay.surface_valid, scale)
     height, width = one.shape
     small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
-    if small or mask.sum() < 1000:
+    common = float((one_mask * other_mask).sum())
+    if small or common < 1000:
         return float("nan")
-    scores = _masked_correlation(one, mask, other, mask, _RIVAL_OVERLAP)
+    scores = _masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
     middle_y, middle_x = height - 1, width - 1
     reach = 1
     here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
@@ -77,7 +78,7 @@ def rival_correlation(overlay: Overlay) -> float:
     ratio = float(scores.max()) / in_place
     if ratio < _UNSUSPICIOUS:
         return ratio
-    by_block = _rival_blocks(one * mask, other * mask, moved)
+    by_block = _rival_blocks(one * one_mask, other * other_mask, moved)
     return min(ratio, by_block) if np.isfinite(by_block) else ratio
 
 
@@ -137,7 +138,8 @@ def best_shift(overlay: Overlay) -> FloatArray:
     scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
     one, one_mask = _edges(*_detail(overlay.template, overlay.template_valid, scale))
     other, other_mask = _edges(*_detail(overlay.surface, overlay.surface_valid, scale))
-    scores = _masked_correlation(one, one_mask, other, other_mask, _SEARCH_OVERLAP)
+    least = _SEARCH_OVERLAP * float(min(one_mask.sum(), other_mask.sum()))
+    scores = _masked_correlation(one, one_mask, other, other_mask, least)
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     height, width = one.shape
     moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
@@ -182,7 +184,7 @@ def _masked_correlation(
     other_mask: Float32Array,
     least_overlap: float,
 ) -> Float32Array:
-    """(2 H − 1, 2 W − 1) normalised |correlation| for every displacement with enough overlap."""
+    """(2 H − 1, 2 W − 1) normalised |correlation|; 0 where fewer than `least_overlap` pixels."""
     height, width = one.shape
     shape = (cv2.getOptimalDFTSize(2 * height - 1), cv2.getOptimalDFTSize(2 * width - 1))
 
@@ -202,6 +204,6 @@ def _masked_correlation(
     together = correlate(spectrum(one), spectrum(other))
     power_one = correlate(spectrum(one * one), mask_b)
     power_other = correlate(mask_a, spectrum(other * other))
-    enough = overlap > least_overlap * float(min(one_mask.sum(), other_mask.sum()))
+    enough = overlap > least_overlap
     power = np.sqrt(np.maximum(power_one * power_other, 1e-6))
     return np.asarray(np.where(enough, np.abs(together) / power, 0.0), dtype=np.float32)

@@ -207,10 +207,10 @@ def match_pass(
     observations = _observe(part, refined, matrix)
     status = refined.status.copy()
     status[~np.isfinite(observations.covariance).all(axis=(1, 2))] = Status.TEXTURE
-    return Dense(refined, observations, *_agreement(part, observations, status, matrix))
+    return Dense(refined, observations, *agreement(part, observations, status, matrix))
 
 
-def _agreement(
+def agreement(
     part: Roles, points: Observations, status: StatusArray, matrix: FloatArray
 ) -> tuple[StatusArray, Estimate | None]:
     """Robust fit of an affine to the patches that agree; where they are few, of a shift.
@@ -222,23 +222,33 @@ def _agreement(
     """
     status = status.copy()
     kept = np.flatnonzero(status == Status.KEPT)
-    model = "affine" if len(kept) >= 3 * minimum_points("affine") else "shift"
-    if len(kept) < 2 * minimum_points(model):
-        return status, None
     frame = part.pair.frame()
     unit = 1.0 if part.ms_is_template() else part.surface_px_per_template_px
-    if model == "shift":
-        estimate = _shifted(points.take(kept), matrix, frame)
-        status[kept[~estimate.inlier]] = Status.RESIDUAL
-        return status, estimate
-    estimate = robust_fit(model, points.take(kept), frame)
-    if np.sqrt(estimate.extra_variance_px2) > _MIXED_SIGMA * unit:
+    estimate = _fit_all(points.take(kept), matrix, frame)
+    if estimate is not None and _is_mixed(estimate, unit):
         inliers = _rigid_core(points.take(kept), unit)
         status[kept[~inliers]] = Status.CONSENSUS
         kept = kept[inliers]
-        estimate = robust_fit(model, points.take(kept), frame)
-    status[kept[~estimate.inlier]] = Status.RESIDUAL
+        estimate = _fit_all(points.take(kept), matrix, frame)
+    if estimate is not None:
+        status[kept[~estimate.inlier]] = Status.RESIDUAL
     return status, estimate
+
+
+def _fit_all(points: Observations, matrix: FloatArray, frame: Frame) -> Estimate | None:
+    """Robust affine through many points, shift of `matrix` through few, None through hardly any."""
+    if len(points) >= 3 * minimum_points("affine"):
+        return robust_fit("affine", points, frame)
+    if len(points) >= 2 * minimum_points("shift"):
+        return _shifted(points, matrix, frame)
+    return None
+
+
+def _is_mixed(estimate: Estimate, unit: float) -> bool:
+    """True when points scatter around an affine by more than patches of one motion do."""
+    if estimate.transformation.model == "shift":
+        return False
+    return bool(np.sqrt(estimate.extra_variance_px2) > _MIXED_SIGMA * unit)
 
 
 def _shifted(points: Observations, matrix: FloatArray, frame: Frame) -> Estimate:

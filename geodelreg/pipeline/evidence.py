@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from affine import Affine
 
 from geodelreg.fit.gate import log10_binomial_tail
+from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay
@@ -15,11 +17,11 @@ from geodelreg.match.refine import Patches, RefineOptions, cut_patches
 from geodelreg.match.surface import Surface, sample
 from geodelreg.pipeline.dense import Tuning, match_pass, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
-from geodelreg.types import Band, FloatArray, IntArray, Status, TiePoints
+from geodelreg.types import Band, FloatArray, Grid, IntArray, Status, TiePoints
 
 _DISPLACED_RADII = (4.0, 9.0)
 _DIRECTIONS = 8
-_BY_CHANCE = 0.25
+_BY_CHANCE = 0.125
 _TESTED_PATCHES = 160
 _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
@@ -31,6 +33,7 @@ _SURE_SIGMAS = 3.0
 _RIVAL_TOLERANCE = 0.2
 _RIVAL_SIGMA = 0.5
 _RIVAL_SCORE = 0.5
+_WIDEST = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +248,32 @@ def overlay(part: Roles, template: Band, surface: Surface, matrix: FloatArray) -
     x, y = to_full @ (columns, rows)
     values, usable = sample(surface, part.to_surface(matrix, np.stack([x, y], axis=-1)))
     return Overlay(template.data, values, template.valid, usable)
+
+
+def widened(part: Roles, template: Band, surface: Band, matrix: FloatArray) -> Band:
+    """The template band with empty margins where the surface band has more to show.
+
+    A rival place may lie there: of a repeated texture that was aligned too far out, the next period
+    further in.  No margin is more than half as wide as the band.
+    """
+    height, width = surface.data.shape
+    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
+    full = apply_affine(~part.surface.grid.transform @ surface.grid.transform, ring)
+    back = ~template.grid.transform @ part.template.grid.transform
+    seen = apply_affine(back, part.to_template(matrix, full))
+    rows, columns = template.data.shape
+    if not np.isfinite(seen).all():
+        return template
+    low, high = -seen.min(axis=0), seen.max(axis=0) - (columns, rows)
+    limit = (columns // _WIDEST, rows // _WIDEST)
+    left, top = (int(v) for v in np.clip(np.ceil(low), 0, limit))
+    right, bottom = (int(v) for v in np.clip(np.ceil(high), 0, limit))
+    margins = ((top, bottom), (left, right))
+    data, valid = np.pad(template.data, margins), np.pad(template.valid, margins)
+    moved = template.grid.transform @ Affine.translation(-left, -top)
+    return replace(
+        template, data=data, valid=valid, grid=Grid(moved, data.shape, template.grid.crs_wkt)
+    )
 
 
 def grey_rmse(overlaid: Overlay, ms_is_template: bool) -> float:

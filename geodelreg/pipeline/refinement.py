@@ -46,6 +46,7 @@ _CONTRADICTION_FLOOR_PX = 0.05
 _CALM_SHARE = 0.9
 _CALM_SIGMA_PX = 0.02
 _SHARPER_SHARE = 0.6
+_TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +116,8 @@ def _of_the_ground(
     hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
     starts = [matrix, IDENTITY] if _near_header(part, matrix) else [matrix]
     found = [_passes(part, hidden, start, options, (_HAZE, _PLAIN)) for start in starts]
-    ground = min((one for one in found if one is not None), key=_scatter, default=None)
+    telling = [one for one in found if one is not None and _kept(one) >= _TELLING_PATCHES]
+    ground = min(telling, key=_scatter, default=None)
     if ground is not None and not _agree(part, ground, everything):
         everything = _passes(part, tiles, ground.matrix, options, (_PLAIN, *_SHARPER))
     if ground is None or everything is None:
@@ -124,6 +126,10 @@ def _of_the_ground(
         return replace(ground, without_bright=True)
     sigma = _difference(part, ground.dense, everything.dense)[1]
     return ground if sigma[0] < _CLEARLY * sigma[1] else everything
+
+
+def _kept(one: Refinement) -> int:
+    return int((one.dense.status == Status.KEPT).sum())
 
 
 def _is_calm(dense: Dense) -> bool:

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from geodelreg.fit.gate import Evidence, is_worthwhile, judge, nothing_agrees, verdict
-from geodelreg.fit.models import IDENTITY, Transformation
+from geodelreg.fit.models import IDENTITY, PARAMETER_COUNT, Transformation
 from geodelreg.fit.select import Selection, half_disagreement, select_model
 from geodelreg.geo.crs import linearise
 from geodelreg.match.area import Overlay, rival_correlation
@@ -25,6 +25,7 @@ from geodelreg.pipeline.evidence import (
     bands_apart,
     overlay,
     rival_motion,
+    widened,
 )
 from geodelreg.pipeline.refinement import (
     COARSE_SIGMA,
@@ -120,7 +121,7 @@ def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
         selection,
         tied,
         dict(hypothesis.counts) | _patch_counts(refined, tied),
-        _agreement_log_nfa(pair, tied),
+        _agreement_log_nfa(pair, tied, selection.estimate.transformation.model),
         pair.pan_px_per_source_px
         * half_disagreement(points.take(selection.estimate.inlier), selection.estimate, corners),
     )
@@ -169,12 +170,12 @@ def _patch_counts(refined: Refinement, points: TiePoints) -> dict[str, int]:
     }
 
 
-def _agreement_log_nfa(pair: Pair, points: TiePoints) -> float:
+def _agreement_log_nfa(pair: Pair, points: TiePoints, model: str) -> float:
     """Chance agreement of patches, each of which may end anywhere within its reach."""
     matched = points.kept | np.isin(points.status, (Status.CONSENSUS, Status.STAR, Status.RESIDUAL))
     gap = np.hypot(*points.residual_px[matched].T)
     reach = 2 * RefineOptions().max_move * max(pair.pan_px_per_source_px, 1.0)
-    return log_nfa(gap, reach**2, 3, reach / 2)[0]
+    return log_nfa(gap, reach**2, PARAMETER_COUNT[model] // 2, reach / 2)[0]
 
 
 def conclude(
@@ -188,7 +189,7 @@ def conclude(
     start = perf_counter()
     pair, estimate = part.pair, fitted.selection.estimate
     matrix = estimate.transformation.matrix
-    before, after = _overlays(part, hypothesis, refined.tuning, matrix)
+    before, after, wide = _overlays(part, hypothesis, refined.tuning, matrix)
     accuracy = measure(part, fitted.points, fitted.selection, before, after)
     area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
     if area.log_chance > _SURE_LOG_CHANCE:
@@ -198,7 +199,7 @@ def conclude(
     )
     evidence = replace(
         _evidence(pair, fitted, accuracy, area),
-        rival=rival_correlation(after),
+        rival=rival_correlation(wide),
         bands_apart=apart,
     )
     grid = pair.lattice()
@@ -240,8 +241,11 @@ def tie_points(part: Roles, dense: Dense, matrix: FloatArray, status: StatusArra
 
 def _overlays(
     part: Roles, hypothesis: Hypothesis, tuning: Tuning, matrix: FloatArray
-) -> tuple[Overlay, Overlay]:
-    """Both images, decimated, one on the other: under the header, and under the correction."""
+) -> tuple[Overlay, Overlay, Overlay]:
+    """Both images, decimated, one on the other: under the header and under the correction.
+
+    The third is the second with all that was read of the finer image.
+    """
     tile = working_tile(part, hypothesis.pair)
     if part.ms_is_template():
         template, finer = tuning.tone(tile.template), tile.surface[0]
@@ -249,7 +253,9 @@ def _overlays(
         template, finer = tile.template[0], tuning.tone(tile.surface)
     sigma = surface_sigma(part, tile, COARSE_SIGMA)
     surface = make_surface(finer, part.surface.grid, sigma)
-    return overlay(part, template, surface, IDENTITY), overlay(part, template, surface, matrix)
+    wide = widened(part, template, finer, matrix)
+    before, after = (overlay(part, template, surface, m) for m in (IDENTITY, matrix))
+    return before, after, after if wide is template else overlay(part, wide, surface, matrix)
 
 
 def _evidence(pair: Pair, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence) -> Evidence:

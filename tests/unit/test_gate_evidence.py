@@ -26,12 +26,16 @@ from geodelreg.pipeline.evidence import (
     bands_apart,
     best_in_place,
     rival_motion,
+    widened,
 )
 from geodelreg.pipeline.state import make_pair
 from geodelreg.pipeline.tiles import read_tiles, roles
 from geodelreg.types import Band, Grid, Status, TiePoints, Window
 
 SIDE = 140
+GRID = Grid(
+    Affine(4.0, 0, 500_000, 0, -4.0, 4_000_000), (SIDE, SIDE), CRS.from_epsg(32618).to_wkt()
+)
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,37 @@ def test_narrow_overlap_of_repeated_texture_still_has_a_rival() -> None:
     tile = texture(9, (20, 20))
     field = np.tile(tile, (7, 2))[:, :36]
     assert rival_correlation(overlaid(field, field)) > MAX_RIVAL
+
+
+def test_a_rival_beyond_the_template_is_seen() -> None:
+    """A strip of repeated texture shows one period; PAN has the next, where no template lies."""
+    period, strip = 60, 50
+    field = np.tile(texture(11, (SIDE, period)), (1, 4))
+    template = np.pad(field[:, :SIDE], ((0, 0), (0, SIDE // 2)))
+    surface = field[:, : SIDE + SIDE // 2]
+    there = np.zeros(template.shape, dtype=bool)
+    there[:, :SIDE] = True
+    seen = np.zeros(template.shape, dtype=bool)
+    seen[:, SIDE - strip :] = True
+    assert rival_correlation(Overlay(template, surface, there & seen, there & seen)) < MAX_RIVAL
+    assert rival_correlation(Overlay(template, surface, there, seen)) > MAX_RIVAL
+
+
+@pytest.mark.parametrize(("beyond", "margin"), [(0, 0), (17, 17), (500, SIDE // 2)])
+def test_a_widened_template_lies_where_it_lay(beyond: int, margin: int) -> None:
+    band = Band(texture(2), np.ones((SIDE, SIDE), dtype=bool), GRID)
+    finer = Grid(
+        GRID.transform @ Affine.translation(-beyond, 0) @ Affine.scale(0.5),
+        (2 * SIDE, 2 * SIDE + 4 * beyond),
+        GRID.crs_wkt,
+    )
+    surface = Band(np.ones(finer.shape, np.float32), np.ones(finer.shape, dtype=bool), finer)
+    part = roles(make_pair(ArrayReader((band,)), ArrayReader((surface,)), AlignOptions()))
+    wide = widened(part, band, surface, IDENTITY)
+    assert wide.data.shape == (SIDE, SIDE + 2 * margin)
+    assert wide.valid.sum() == SIDE**2
+    assert wide.grid.transform @ (margin, 0) == pytest.approx(GRID.transform @ (0, 0))
+    np.testing.assert_array_equal(wide.data[:, margin : margin + SIDE], band.data)
 
 
 def two_bands(parallax_px: float) -> float:

@@ -1,0 +1,52 @@
+"""Dense patches that agree, a few that do, and none: a fit, or none, and no error."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from geodelreg.fit.estimate import Observations
+from geodelreg.fit.models import IDENTITY, Frame
+from geodelreg.pipeline.dense import agreement
+from geodelreg.pipeline.tiles import Roles
+from geodelreg.types import Status
+
+PART = cast(
+    Roles,
+    SimpleNamespace(
+        pair=SimpleNamespace(frame=lambda: Frame((100.0, 100.0), 100.0)),
+        ms_is_template=lambda: True,
+    ),
+)
+
+
+def observe(moves: np.ndarray, sigma_px: float = 0.01) -> Observations:
+    """Patches of a raster of 200 px that moved so far, with errors."""
+    rng = np.random.default_rng(len(moves))
+    source = rng.uniform(0, 200, (len(moves), 2))
+    target = source + moves + sigma_px * rng.standard_normal(moves.shape)
+    return Observations(source, target, np.broadcast_to(sigma_px**2 * np.eye(2), (*moves.shape, 2)))
+
+
+@pytest.mark.parametrize("alike", [0, 2, 4, 30])
+def test_patches_most_of_which_go_their_own_way(alike: int) -> None:
+    rng = np.random.default_rng(alike)
+    moves = np.concatenate([np.full((alike, 2), 0.4), rng.uniform(-1.5, 1.5, (12, 2))])
+    points = observe(moves)
+    status, estimate = agreement(PART, points, np.zeros(len(moves), np.uint8), IDENTITY)
+    assert len(status) == len(moves)
+    if alike == 30:
+        assert estimate is not None
+        assert (status[:alike] == Status.KEPT).mean() > 0.9
+        moved = estimate.transformation(np.array([[100.0, 100.0]])) - 100.0
+        np.testing.assert_allclose(moved, 0.4, atol=0.02)
+
+
+@pytest.mark.parametrize(("count", "model"), [(0, None), (3, None), (8, "shift"), (40, "affine")])
+def test_the_model_grows_with_the_number_of_patches(count: int, model: str | None) -> None:
+    points = observe(np.full((count, 2), 0.3))
+    _, estimate = agreement(PART, points, np.zeros(count, np.uint8), IDENTITY)
+    assert (estimate.transformation.model if estimate else None) == model
