@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
-from benchmarks.gate_pairs import Case, cases, make_pair
+from benchmarks.gate_pairs import Case, cases, is_there, make_pair
 from benchmarks.gate_report import false_accept, figure, page
 from benchmarks.report import replace_section
 from benchmarks.scenes import write_scene
@@ -132,7 +132,10 @@ def _wanted(args: argparse.Namespace) -> list[Case]:
     groups = {"": (False, True), "hopeless": (False,), "alignable": (True,)}[args.group]
     queues = [cases(group, args.count, args.part) for group in groups]
     mixed = [case for together in zip(*queues, strict=True) for case in together]
-    return [case for case in mixed if args.kind in ("", case.kind)]
+    there = [case for case in mixed if is_there(case, args.data)]
+    if len(there) < len(mixed):
+        print(f"{len(mixed) - len(there)} pairs left out: their imagery is not in {args.data}")
+    return [case for case in there if args.kind in ("", case.kind)]
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from benchmarks.ground import cloud_layer, fractal
 from benchmarks.imagery import Imagery, ImageryNotFoundError, sentinel2
 from benchmarks.scenes import HeaderError, Scene, SceneSpec, make_scene
 from benchmarks.truth import Truth
+from geodelreg.types import Window
 
 TUNING, HELD_OUT = "tuning", "held out"
 UTM_WKT_EPSG = 32618
@@ -28,24 +29,34 @@ PAN_SIDES_PX = {"small": (180, 230), "clouds and no data": (400, 520)}
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Real imagery: where it is, its bands, and whether limits were set on it."""
+    """Real imagery: where it is, its bands, whether limits were set on it, and its window."""
 
     pattern: str
     bands: tuple[int, ...]
     part: str
+    window: Window | None = None  # column, row, width, height; None = the whole
 
 
 SOURCES: dict[str, Source] = {
     "sentinel2": Source("", (), TUNING),
     "landsat8_momotombo": Source("landsat8_momotombo/ms.tif", (1, 2, 3, 4), TUNING),
     "naip": Source("naip/*2012*.tif", (3, 2, 1, 4), TUNING),
-    "landsat8_oman": Source("landsat8_oman/ms.tif", (1, 2, 3, 1), HELD_OUT),
-    "landsat8_clouds": Source("landsat8_clouds/ms.tif", (1, 2, 3, 4), HELD_OUT),
-    "landsat8_twodates": Source("landsat8_twodates/20190809.tif", (1, 2, 3, 4), HELD_OUT),
-    "landsat_geographic": Source("landsat_geographic/2000.tif", (3, 2, 1, 4), HELD_OUT),
-}
+    "landsat8_oman": Source("landsat8_oman/ms.tif", (1, 2, 3, 1), TUNING),
+    "landsat8_clouds": Source("landsat8_clouds/ms.tif", (1, 2, 3, 4), TUNING),
+    "landsat8_twodates": Source("landsat8_twodates/20190809.tif", (1, 2, 3, 4), TUNING),
+    "landsat_geographic": Source("landsat_geographic/2000.tif", (3, 2, 1, 4), TUNING),
+    "landsat8_kanto": Source(
+        "rio-pansharpen/LC81070352015122LGN00_B*.tif", (0, 1, 2, 2), HELD_OUT,
+        Window(250, 450, 800, 800),
+    ),
+    "landsat8_guangdong": Source(
+        "rio-pansharpen/LC81210442015044LGN00_B*.tif", (0, 1, 2, 2), HELD_OUT,
+        Window(220, 600, 1060, 460),
+    ),
+}  # fmt: skip
+"""Bands are blue, green, red, infrared; of one file per band, in the order of their names."""
 LATER = {
-    "landsat8_twodates": Source("landsat8_twodates/20190825.tif", (1, 2, 3, 4), HELD_OUT),
+    "landsat8_twodates": Source("landsat8_twodates/20190825.tif", (1, 2, 3, 4), TUNING),
 }
 PROCEDURAL = {
     "white": TUNING,
@@ -164,9 +175,29 @@ def imagery_of(name: str, data: Path, later: bool = False) -> Imagery:
     files = sorted(data.glob(source.pattern))
     if not files:
         raise ImageryNotFoundError(f"no {source.pattern} in {data}")
+    read = partial(_read, window=source.window)
+    if min(source.bands) == 0:
+        bands = np.concatenate([read(files[number], [1]) for number in source.bands])
+    else:
+        bands = read(files[0], list(source.bands))
+    column, row = source.window[:2] if source.window else (0, 0)
     with rasterio.open(files[0]) as raster:
-        bands = raster.read(list(source.bands), out_dtype="float32")
-        return Imagery(np.nan_to_num(bands), raster.transform, raster.crs.to_wkt(), name)
+        transform = raster.transform @ Affine.translation(column, row)
+        return Imagery(bands, transform, raster.crs.to_wkt(), name)
+
+
+def _read(file: Path, numbers: list[int], window: Window | None) -> NDArray[np.float32]:
+    import rasterio
+
+    part = rasterio.windows.Window(*window) if window else None
+    with rasterio.open(file) as raster:
+        return np.asarray(np.nan_to_num(raster.read(numbers, window=part)), dtype=np.float32)
+
+
+def is_there(case: Case, data: Path) -> bool:
+    """True when the imagery that a pair is made of is in the folder."""
+    names = [name for name in (case.source, case.other) if name in SOURCES]
+    return all(not SOURCES[n].pattern or any(data.glob(SOURCES[n].pattern)) for n in names)
 
 
 def _land(imagery: Imagery) -> Imagery:
