@@ -13,6 +13,7 @@ _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _STUDENT_DOF = 6.0
 _REJECT_D2 = 25.0
 _SPREAD_ROUNDS = 6
+_BISECTIONS = 16
 _MOST_LEVERAGE = 0.95
 
 
@@ -134,6 +135,7 @@ def robust_fit(
     if len(points) < minimum_points(model):
         raise ValueError(f"{len(points)} points cannot determine a {model}")
     extra = extra_variance_px2 or 0.0
+    variances, axes = np.linalg.eigh(points.covariance)
     student = np.ones(len(points))
     previous = None
     for number in range(20):
@@ -141,7 +143,7 @@ def robust_fit(
         parameters, normal = weighted_fit(model, points, inverse * student[:, None, None], frame)
         residual = transformation(model, parameters, frame).residuals(points.source, points.target)
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
-            extra = common_variance(residual, points.covariance)
+            extra = _variance_left(residual, variances, axes)
             inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
         student = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
@@ -201,16 +203,30 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
     float
         0 when the covariances already explain the residuals.
     """
-    variances, axes = np.linalg.eigh(covariance)
-    along2 = np.einsum("nji,nj->ni", axes, residual) ** 2
+    return _variance_left(residual, *np.linalg.eigh(covariance))
+
+
+def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
+    """`common_variance` from the eigenvalues and eigenvectors of the covariances."""
+    one, other = np.einsum("nji,nj->in", axes, residual) ** 2
+    first, second = np.ascontiguousarray(variances.T)
 
     def median_at(extra: float) -> float:
-        return float(np.median((along2 / (variances + extra)).sum(axis=1)))
+        return _median(one / (first + extra) + other / (second + extra))
 
     if median_at(0.0) <= _MEDIAN_CHI2_2:
         return 0.0
-    low, high = 0.0, float(np.median((residual**2).sum(axis=1)) + 1e-12)
-    for _ in range(24):
+    low, high = 0.0, _median((residual**2).sum(axis=1)) + 1e-12
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         low, high = (middle, high) if median_at(middle) > _MEDIAN_CHI2_2 else (low, middle)
     return high
+
+
+def _median(values: FloatArray) -> float:
+    """`np.median` of (N,) finite values without its checks, which cost more than the median."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    ordered = np.partition(values, (half - 1, half))
+    return float(ordered[half - 1] + ordered[half]) / 2
