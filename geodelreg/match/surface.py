@@ -129,13 +129,16 @@ def high_pass(band: Band, sigma_px: float) -> Band:
 
 
 def _fill(band: Band, taps: list[FloatArray]) -> tuple[Float32Array, BoolArray]:
-    """Replace invalid pixels by a local mean; usable where the low-pass sees none of them."""
+    """Replace invalid pixels by a local mean; usable where the low-pass sees none of them.
+
+    The mean is a box's, whose cost does not grow with its width: it only has to meet its valid
+    neighbours smoothly enough for the spline's short memory.
+    """
     valid = band.valid.astype(np.float32)
     mean = np.float32(band.data[band.valid].mean()) if band.valid.any() else np.float32(0)
     centred = np.where(band.valid, band.data - mean, np.float32(0))
-    wide = [np.convolve(t, np.ones(5) / 5) for t in taps]
-    weight = cv2.sepFilter2D(valid, cv2.CV_32F, wide[0], wide[1])
-    local = cv2.sepFilter2D(centred, cv2.CV_32F, wide[0], wide[1]) / np.maximum(weight, 1e-3)
+    box = (len(taps[0]) + 4, len(taps[1]) + 4)
+    local = cv2.blur(centred, box) / np.maximum(cv2.blur(valid, box), np.float32(1e-3))
     filled = np.where(band.valid, centred, local) + mean
     near = cv2.sepFilter2D(valid, cv2.CV_32F, taps[0], taps[1])
     return filled.astype(np.float32), np.asarray(near > _VALID_SHARE)
