@@ -9,7 +9,7 @@ Ackermann 1984; with the linear regression form, template noise alone enters the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,19 @@ from numpy.typing import NDArray
 from geodelreg.geo.crs import linearise
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.match.surface import Surface, sample_patches
-from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, Status, StatusArray
+from geodelreg.types import (
+    Band,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Grid,
+    IntArray,
+    Status,
+    StatusArray,
+)
 
+ROUGH_STEP = 0.04
+"""Tolerance where hundredths of a pixel suffice: the step after such a one is much smaller."""
 _MARGIN = 1
 _TINY = 1e-30
 
@@ -37,22 +48,28 @@ class RefineOptions:
     max_move : float
         A patch that moves further than this, in template pixels, has not converged.
     tolerance : float
-        Steps below this, in template pixels, are converged.
+        Patches whose step is below this, in template pixels, take no further one.
+    max_step : float
+        A patch whose last step is above this, in template pixels, has not converged.
     min_valid : float
         Least share of usable pixels in a patch.
     min_correlation : float
         Least absolute correlation after matching.
     max_sigma : float
         Largest standard error along the worse axis, in template pixels.
+    every : int
+        Match only every so many-th patch: enough where little is asked of the result.
     """
 
     size: int = 20
     iterations: int = 4
     max_move: float = 1.5
     tolerance: float = 0.01
+    max_step: float = 0.05
     min_valid: float = 0.6
     min_correlation: float = 0.5
     max_sigma: float = 0.5
+    every: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +97,15 @@ class Patches:
 
     def __len__(self) -> int:
         return len(self.centre)
+
+    def take(self, chosen: IntArray | slice) -> Patches:
+        """Some of the patches."""
+        return replace(
+            self,
+            centre=self.centre[chosen],
+            values=self.values[chosen],
+            valid=self.valid[chosen],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +209,7 @@ def refine(
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(_finite(covariance))[:, 1], 0))
     status = np.zeros(count, dtype=np.uint8)
     status[np.abs(correlation) < options.min_correlation] = Status.CORRELATION
-    status[(last > 5 * options.tolerance) | (np.abs(move).max(axis=1) > options.max_move)] = (
+    status[(last > options.max_step) | (np.abs(move).max(axis=1) > options.max_move)] = (
         Status.CONVERGENCE
     )
     status[~(spread < options.max_sigma) | (share < options.min_valid)] = Status.TEXTURE

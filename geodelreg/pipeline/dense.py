@@ -197,6 +197,8 @@ def match_pass(
     def one(tile: Tile) -> Refined | None:
         bands, surface = tile_images(part, tile, tuning)
         patches = cut_patches(bands, part.template.grid, options.size)
+        if options.every > 1:
+            patches = patches.take(slice(None, None, options.every))
         if not len(patches):
             return None
         return refine(patches, surface, lambda xy: part.to_surface(matrix, xy), options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -13,9 +14,9 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.match.area import Overlay
-from geodelreg.match.refine import Patches, RefineOptions, cut_patches
+from geodelreg.match.refine import ROUGH_STEP, Patches, RefineOptions, cut_patches
 from geodelreg.match.surface import Surface, sample
-from geodelreg.pipeline.dense import Tuning, match_pass, tile_images
+from geodelreg.pipeline.dense import Dense, Tuning, match_pass, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
 from geodelreg.types import Band, FloatArray, Grid, IntArray, Status, TiePoints
 
@@ -92,7 +93,7 @@ def area_evidence(
     angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
-    every = max(len(tiles) * 16 // _TESTED_PATCHES, 1) if few else 1
+    every = _sample_step(tiles, size) if few else 1
     found = AreaEvidence()
     for number, tile in enumerate(tiles):
         bands, surface = tile_images(part, tile, tuning)
@@ -101,6 +102,13 @@ def area_evidence(
         scores = _explained(part, matrix, surface, patches, chosen, offsets)
         found = found.plus(best_in_place(scores))
     return found
+
+
+def _sample_step(tiles: list[Tile], size: int) -> int:
+    """Every which patch to look at, so that `_TESTED_PATCHES` or a few more are."""
+    shapes = [tile.template[0].data.shape for tile in tiles]
+    count = int(sum((height // size) * (width // size) for height, width in shapes))
+    return max(count // _TESTED_PATCHES, 1)
 
 
 def best_in_place(scores: FloatArray) -> AreaEvidence:
@@ -146,10 +154,16 @@ def bands_apart(
     centre = np.array([[width / 2, height / 2]])
     count = len(pair.source_bands)
     some = tiles[:: max(len(tiles) // _BAND_TILES, 1)]
-    found = []
-    for band in _spread(count, _BANDS) if count > 1 else []:
+    options = RefineOptions(size=size, tolerance=ROUGH_STEP, every=_sample_step(some, size))
+
+    def by_itself(band: int) -> Dense:
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
-        dense = match_pass(part, some, matrix, alone, RefineOptions(size=size), threads)
+        return match_pass(part, some, matrix, alone, options, 1)
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        matched = list(pool.map(by_itself, _spread(count, _BANDS) if count > 1 else []))
+    found = []
+    for dense in matched:
         if dense.estimate is not None:
             place = dense.estimate.transformation(centre)[0]
             kept = int((dense.status == Status.KEPT).sum())
