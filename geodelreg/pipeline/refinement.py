@@ -31,7 +31,12 @@ from geodelreg.pipeline.tiles import (
 )
 from geodelreg.types import FloatArray, Status
 
-_PASSES = 3
+_PASSES = 2
+_PASSES_FROM_AFAR = 3
+_SOME_TILES = 2
+_MANY_TILES = 5
+_LAST_TOLERANCE = 0.005
+_LAST_ITERATIONS = 5
 _NEAR_HEADER_PX = 4.0
 COARSE_SIGMA = 0.35
 _COARSE_FROM = 1.5
@@ -114,10 +119,9 @@ def _of_the_ground(
     if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
         return everything
     hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
-    starts = [matrix, IDENTITY] if _near_header(part, matrix) else [matrix]
-    found = [_passes(part, hidden, start, options, (_HAZE, _PLAIN)) for start in starts]
-    telling = [one for one in found if one is not None and _kept(one) >= _TELLING_PATCHES]
-    ground = min(telling, key=_scatter, default=None)
+    ground = _passes(part, hidden, matrix, options, (_HAZE, _PLAIN), _near_header(part, matrix))
+    if ground is not None and _kept(ground) < _TELLING_PATCHES:
+        ground = None
     if ground is not None and not _agree(part, ground, everything):
         everything = _passes(part, tiles, ground.matrix, options, (_PLAIN, *_SHARPER))
     if ground is None or everything is None:
@@ -180,26 +184,57 @@ def _passes(
     matrix: FloatArray,
     options: RefineOptions,
     looks: tuple[Look, ...],
+    or_header: bool = False,
 ) -> Refinement | None:
-    """Passes with the first way to look at the images, then the others if they are sharper."""
+    """Passes with the first way to look at the images, then the others if they are sharper.
+
+    All but the last go over some of the tiles; with `or_header` they also start from the header,
+    and the start that more patches agree with more closely is taken.
+    """
     threads = thread_count(part.pair)
-    sigma, dense, tuning = DEFAULT_SIGMA, None, None
-    for number in range(_PASSES):
-        tone = fit_tone(part, tiles, matrix, sigma)
-        tuning = Tuning(sigma, tone, *looks[0])
+    some = tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
+    starts = [matrix, IDENTITY] if or_header else [matrix]
+    passes = _PASSES_FROM_AFAR if or_header else _PASSES
+    near: Refinement | None = None
+    for where in [some, tiles] if some is not tiles else [tiles]:
+        found = [_approach(part, where, m, options, looks[0], passes) for m in starts]
+        near = min((one for one in found if one is not None), key=_scatter, default=None)
+        if near is not None:
+            break
+    if near is None:
+        return None
+    tone = fit_tone(part, tiles, near.matrix, near.tuning.sigma)
+    tuning = replace(near.tuning, tone=tone)
+    options = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
+    dense = match_pass(part, tiles, near.matrix, tuning, options, threads)
+    if dense.estimate is None:
+        return None
+    best = Refinement(tiles, tuning, dense, dense.estimate.transformation.matrix, options.size)
+    return best if _is_calm(dense) else _sharpest(part, best, looks[1:], options, threads)
+
+
+def _approach(
+    part: Roles,
+    tiles: list[Tile],
+    matrix: FloatArray,
+    options: RefineOptions,
+    look: Look,
+    passes: int,
+) -> Refinement | None:
+    """Passes towards the transformation and the point spread, from a start a few pixels off."""
+    threads = thread_count(part.pair)
+    sigma, near = DEFAULT_SIGMA, None
+    for number in range(passes):
+        tuning = Tuning(sigma, fit_tone(part, tiles, matrix, sigma), *look)
         if number == 1:
             sigma = fit_sigma(part, tiles, matrix, tuning)
             tuning = replace(tuning, sigma=sigma)
         dense = match_pass(part, tiles, matrix, tuning, options, threads)
         if dense.estimate is None:
-            break
+            return None
         matrix = dense.estimate.transformation.matrix
-    if dense is None or tuning is None:
-        return None
-    best = Refinement(tiles, tuning, dense, matrix, options.size)
-    if not _is_calm(dense):
-        best = _sharpest(part, best, looks[1:], options, threads)
-    return best if best.dense.estimate is not None else None
+        near = Refinement(tiles, tuning, dense, matrix, options.size)
+    return near
 
 
 def _sharpest(
