@@ -33,6 +33,9 @@ def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
     count = len(moment)
     weights, passive = np.zeros(count), np.zeros(count, dtype=bool)
     ridge = gram + np.eye(count) * 1e-9 * max(float(np.trace(gram)), 1e-30) / count
+    unbounded = np.asarray(np.linalg.solve(ridge, moment), dtype=np.float64)
+    if (unbounded > 0).all():
+        return unbounded
     for _ in range(3 * count):
         slope = moment - ridge @ weights
         slope[passive] = -np.inf

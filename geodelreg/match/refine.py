@@ -243,19 +243,34 @@ def _gauss_newton(
     image = values.reshape(-1, side, side)
     good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
     good = good & patches.valid[active]
-    weight: Float32Array = good.astype(np.float32)
-    along_x: Float32Array = (image[:, 1:-1, 2:] - image[:, 1:-1, :-2]).reshape(-1, n * n)
-    along_y: Float32Array = (image[:, 2:, 1:-1] - image[:, :-2, 1:-1]).reshape(-1, n * n)
-    along_x, along_y = along_x * np.float32(0.5), along_y * np.float32(0.5)
-    inner = image[:, 1:-1, 1:-1].reshape(len(active), n * n)
-    columns = [inner, along_x, along_y]
-    columns.extend(patches.values[active].transpose(1, 0, 2))
-    total = np.maximum(weight.sum(axis=1, keepdims=True), 1)
-    centred = [(c - (c * weight).sum(axis=1, keepdims=True) / total) * weight for c in columns]
-    stack = np.stack(centred, axis=1)
+    bands = patches.values.shape[1]
+    cube = np.empty((len(active), 3 + bands, n, n), dtype=np.float32)
+    cube[:, 0] = image[:, 1:-1, 1:-1]
+    np.subtract(image[:, 1:-1, 2:], image[:, 1:-1, :-2], out=cube[:, 1])
+    np.subtract(image[:, 2:, 1:-1], image[:, :-2, 1:-1], out=cube[:, 2])
+    cube[:, 1:3] *= np.float32(0.5)
+    stack = cube.reshape(len(active), 3 + bands, n * n)
+    stack[:, 3:] = patches.values[active]
+    total = _centre(stack, good)
     gram = np.matmul(stack, stack.transpose(0, 2, 1)).astype(np.float64)
     solve = _template_on_image if patches.values.shape[1] == 1 else _image_on_bands
-    return solve(gram, total[:, 0].astype(np.float64), good.mean(axis=1))
+    return solve(gram, total, good.mean(axis=1))
+
+
+def _centre(stack: Float32Array, good: BoolArray) -> FloatArray:
+    """Take each row's mean over good pixels off (P, K, n²) in place, 0 elsewhere; (P,) good ones.
+
+    Where all are good, as nearly everywhere, nothing needs a weight.
+    """
+    if good.all():
+        stack -= stack.mean(axis=2, keepdims=True)
+        return np.full(len(stack), float(good.shape[1]))
+    weight = good.astype(np.float32)[:, None]
+    total = np.maximum(weight.sum(axis=2, keepdims=True), np.float32(1))
+    stack *= weight
+    stack -= stack.sum(axis=2, keepdims=True) / total
+    stack *= weight
+    return np.asarray(total[:, 0, 0], dtype=np.float64)
 
 
 def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:

@@ -231,9 +231,9 @@ def _two_taps(at: Float32Array) -> tuple[Float32Array, Float32Array, Float32Arra
     base = np.floor(at)
     f = at - base
     square = f * f
-    cube = square * f
-    w1 = (4 - 6 * square + 3 * cube) / np.float32(6)
-    w3 = cube / np.float32(6)
-    low = (1 - 3 * f + 3 * square - cube) / np.float32(6) + w1
-    high = 1 - low
-    return base - 1 + w1 / low, base + 1 + w3 / high, low
+    # six times the weights of the first two and the last two of the four spline coefficients
+    low = ((2 * f - 3) * f - 3) * f + 5
+    high = 6 - low
+    first = base - 1 + ((3 * f - 6) * square + 4) / low
+    second = base + 1 + square * f / high
+    return first, second, low / np.float32(6)
