@@ -96,11 +96,18 @@ def _decimation(band: Band, full: Affine) -> tuple[float, float]:
     return abs(step.a), abs(step.e)
 
 
-def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -> SyntheticPan:
+def fit_tone(
+    part: Roles,
+    tiles: list[Tile],
+    matrix: FloatArray,
+    sigma: float,
+    threads: int,
+    samples: int = _TONE_SAMPLES,
+) -> SyntheticPan:
     """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
-    per_tile = max(_TONE_SAMPLES // len(tiles), 64)
-    bands, target = [], []
-    for tile in tiles:
+    per_tile = max(samples // len(tiles), 64)
+
+    def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
         xy, take = _lattice(tile.template[0], part, per_tile)
         surfaces = _surfaces(part, tile, sigma)
         place = part.to_surface(matrix, xy)[:, None]
@@ -109,9 +116,10 @@ def fit_tone(part: Roles, tiles: list[Tile], matrix: FloatArray, sigma: float) -
         good &= np.logical_and.reduce([band.valid[take] for band in tile.template])
         coarse = np.stack([band.data[take][good] for band in tile.template])
         smooth = np.stack([v[good, 0] + s.level for (v, _), s in zip(fine, surfaces, strict=True)])
-        ms, pan = (coarse, smooth) if part.ms_is_template() else (smooth, coarse)
-        bands.append(ms)
-        target.append(pan[0])
+        return (coarse, smooth[0]) if part.ms_is_template() else (smooth, coarse[0])
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        bands, target = zip(*pool.map(samples_of, tiles), strict=True)
     stacked, goal = np.concatenate(bands, axis=1), np.concatenate(target)
     fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= _LEAST_SAMPLES else None
     return fitted or single_band(len(stacked), 0)
@@ -154,12 +162,14 @@ def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Su
     return templates, surface
 
 
-def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning) -> float:
+def fit_sigma(
+    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, threads: int
+) -> float:
     """Low-pass with which the finer image resembles the coarser one most, in template pixels."""
     count = max(_SIGMA_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
-    unlike = []
-    for sigma in _SIGMA_CANDIDATES:
+
+    def unexplained(sigma: float) -> float:
         total = 0.0
         for tile in chosen:
             images = Tile(tile.template, tile.surface)
@@ -168,7 +178,10 @@ def fit_sigma(part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
             good = usable[:, 0] & template.valid[take]
             total += _unexplained(values[good, 0], template.data[take][good])
-        unlike.append(total)
+        return total
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        unlike = list(pool.map(unexplained, _SIGMA_CANDIDATES))
     best = int(np.argmin(unlike))
     if best in (0, len(unlike) - 1):
         return _SIGMA_CANDIDATES[best]

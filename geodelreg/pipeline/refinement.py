@@ -37,6 +37,7 @@ _SOME_TILES = 2
 _MANY_TILES = 5
 _LAST_TOLERANCE = 0.005
 _LAST_ITERATIONS = 5
+_FEWER_SAMPLES = 4_000
 _NEAR_HEADER_PX = 4.0
 COARSE_SIGMA = 0.35
 _COARSE_FROM = 1.5
@@ -203,14 +204,15 @@ def _passes(
             break
     if near is None:
         return None
-    tone = fit_tone(part, tiles, near.matrix, near.tuning.sigma)
+    if not _is_calm(near.dense):
+        near = _sharpest(part, near, looks[1:], options, threads)
+    tone = fit_tone(part, tiles, near.matrix, near.tuning.sigma, threads)
     tuning = replace(near.tuning, tone=tone)
     options = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
     dense = match_pass(part, tiles, near.matrix, tuning, options, threads)
     if dense.estimate is None:
         return None
-    best = Refinement(tiles, tuning, dense, dense.estimate.transformation.matrix, options.size)
-    return best if _is_calm(dense) else _sharpest(part, best, looks[1:], options, threads)
+    return Refinement(tiles, tuning, dense, dense.estimate.transformation.matrix, options.size)
 
 
 def _approach(
@@ -225,9 +227,9 @@ def _approach(
     threads = thread_count(part.pair)
     sigma, near = DEFAULT_SIGMA, None
     for number in range(passes):
-        tuning = Tuning(sigma, fit_tone(part, tiles, matrix, sigma), *look)
+        tuning = Tuning(sigma, fit_tone(part, tiles, matrix, sigma, threads, _FEWER_SAMPLES), *look)
         if number == 1:
-            sigma = fit_sigma(part, tiles, matrix, tuning)
+            sigma = fit_sigma(part, tiles, matrix, tuning, threads)
             tuning = replace(tuning, sigma=sigma)
         dense = match_pass(part, tiles, matrix, tuning, options, threads)
         if dense.estimate is None:
@@ -257,12 +259,7 @@ def _sharpest(
         assert dense.estimate is not None
         matrix = dense.estimate.transformation.matrix
         best, changed = replace(best, tuning=tuning, dense=dense, matrix=matrix), True
-    if not changed:
-        return plain
-    dense = match_pass(part, best.tiles, best.matrix, best.tuning, options, threads)
-    if dense.estimate is None:
-        return best
-    return replace(best, dense=dense, matrix=dense.estimate.transformation.matrix)
+    return best
 
 
 def _moved(part: Roles, one: Dense, other: Dense) -> bool:
@@ -288,7 +285,7 @@ def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:
     tile = working_tile(part, images)
     if hypothesis.bright is not None:
         tile = _without_bright(part, tile, hypothesis)
-    tone = fit_tone(part, [tile], hypothesis.matrix, COARSE_SIGMA)
+    tone = fit_tone(part, [tile], hypothesis.matrix, COARSE_SIGMA, 1)
     tuning = Tuning(COARSE_SIGMA, tone)
     dense = match_pass(part, [tile], hypothesis.matrix, tuning, RefineOptions(), 1)
     return dense.estimate.transformation.matrix if dense.estimate else hypothesis.matrix
