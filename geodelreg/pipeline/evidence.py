@@ -160,6 +160,7 @@ def bands_apart(
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
         return match_pass(part, some, matrix, alone, options, 1)
 
+    # the tiles still hold the last pass's surfaces, so that the threads share them and make none
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         matched = list(pool.map(by_itself, _spread(count, _BANDS) if count > 1 else []))
     found = []
