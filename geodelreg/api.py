@@ -16,6 +16,7 @@ from geodelreg.errors import (
     OutputUnwritableError,
     UsageError,
 )
+from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg.pipeline.check import (
@@ -52,8 +53,13 @@ class _Rasters:
 
 
 @contextmanager
-def _open(source: AnyPath | Sequence[AnyPath], reference: AnyPath) -> Iterator[_Rasters]:
-    with open_raster(source) as ms, open_raster(reference) as pan:
+def _open(
+    source: AnyPath | Sequence[AnyPath], reference: AnyPath, options: AlignOptions
+) -> Iterator[_Rasters]:
+    with (
+        open_raster(source, options.masks) as ms,
+        open_raster(reference, options.pan_masks) as pan,
+    ):
         yield _Rasters(ms, pan, _paths(source), str(reference))
 
 
@@ -87,17 +93,20 @@ def align(
     AlignmentRefusedError
         When the evidence does not support any correction; its ``alignment`` holds all that was
         found out.
+    MaskError
+        When a mask of `options` cannot be used.
     GeodelregError
         Its other kinds, for bad input.
     """
     options = options or AlignOptions()
     start = perf_counter()
-    with _open(source, reference) as rasters:
+    with _open(source, reference, options) as rasters:
         alignment, _ = _examine(rasters, options, progress, start)
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
         raise AlignmentRefusedError(
-            f"{rasters.ms.name} and {rasters.pan.name} were not aligned: " + "; ".join(failed),
+            f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
+            + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),
             "Check that both show the same ground; try --band with the band that looks most like "
             "PAN, a larger --search-radius, or a simpler --model.",
             alignment,
@@ -147,7 +156,7 @@ def check(
         raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options = replace(options or AlignOptions(), tolerance_px=0.0)
     start = perf_counter()
-    with _open(source, reference) as rasters:
+    with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = _part_of(progress, 0, count + 1)
         alignment, misalignment = _examine(rasters, options, report, start)
@@ -211,14 +220,17 @@ def _examine(
     files = (*rasters.source_paths, rasters.reference_path)
     prints = {path: fingerprint(path) for path in files}
     opened = perf_counter() - start
-    pair, solution = register(ms, pan, options, progress)
+    try:
+        pair, solution = register(ms, pan, options, progress)
+    except NoDataError as error:
+        raise under_masks(error, ms, pan) from error
     alignment = _alignment(rasters, pair, solution)
     notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
     timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
     alignment = replace(
         alignment,
         timings_s=timings,
-        warnings=alignment.warnings + notes,
+        warnings=alignment.warnings + notes + mask_warnings(ms, pan),
         extra={"fingerprints": prints},
     )
     return alignment, measure_misalignment(pair, solution)
@@ -241,6 +253,7 @@ def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
         options=pair.options,
         versions=versions(),
         timings_s=solution.timings_s,
+        masks=mask_uses(rasters.ms, rasters.pan),
     )
 
 

@@ -5,10 +5,12 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from geodelreg.errors import UsageError
+from geodelreg.masking import parse_mask
 
 METHODS = ("delaunay", "zhang2013", "sift")
 MODELS = ("auto", "shift", "scale", "similarity", "affine")
@@ -31,6 +33,17 @@ def _check_choice(options: object, name: str) -> None:
     choices, value = spec.metadata["choices"], getattr(options, name)
     if value not in choices:
         raise UsageError(f"{name} = {value!r} is unknown", f"Use one of: {', '.join(choices)}.")
+
+
+def _check_masks(options: object, name: str) -> None:
+    """Check the names of masks, and make paths of any kind strings."""
+    value = getattr(options, name)
+    if isinstance(value, str | os.PathLike):
+        raise UsageError(f"{name} = {value!r} is one name", "Give a tuple of them.")
+    masks = tuple(os.fspath(mask) for mask in value)
+    for mask in masks:
+        parse_mask(mask)
+    object.__setattr__(options, name, masks)
 
 
 def _check_range(options: object, name: str, low: float, high: float) -> None:
@@ -60,6 +73,18 @@ class AlignOptions:
         "MS band to match on, from 1; auto weights the bands so that together they look like PAN.",
     )
     pan_band: int = _knob(1, "Band of the PAN (reference) raster to match on, from 1.")
+    masks: tuple[str, ...] = _knob(
+        (),
+        "Leave out the MS pixels that this mask hides; it is placed by its own header, in the "
+        "frame of MS. A vector file hides what it touches; a Landsat QA_PIXEL or Sentinel-2 SCL "
+        "band hides fill, cloud, cirrus and shadow; of another raster every value but 0 and "
+        "no-data hides. HIDE says it otherwise: values (3,8-10), or binary, landsat-qa, "
+        "sentinel2-scl. May be repeated.",
+    )
+    pan_masks: tuple[str, ...] = _knob(
+        (),
+        "The same for PAN. One of the two is enough for any place: a tie point needs both images.",
+    )
     search_radius_px: float = _knob(
         512.0,
         "How far off, in PAN pixels, the header may be for the first search; when that finds "
@@ -92,6 +117,8 @@ class AlignOptions:
         _check_choice(self, "model")
         _check_range(self, "band", 1, 65535)
         _check_range(self, "pan_band", 1, 65535)
+        _check_masks(self, "masks")
+        _check_masks(self, "pan_masks")
         _check_range(self, "search_radius_px", 0, 1e7)
         _check_range(self, "tolerance_px", 0, 1e3)
         _check_range(self, "ratio", 0.1, 1.0)

@@ -17,6 +17,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from geodelreg.masking import MaskUse
     from geodelreg.options import AlignOptions
 
 FloatArray = NDArray[np.float64]
@@ -374,9 +375,9 @@ class Alignment:
     crs_operation : str
         pyproj's operation from MS to PAN coordinates, with its accuracy; "" for equal CRSs.
     options : AlignOptions
-    versions : dict of str to str
-    timings_s : dict of str to float
-        Wall time of the stages.
+    versions, timings_s : dict
+        Of everything that can change a result; wall time of the stages.
+    masks : tuple of MaskUse
     """
 
     source: Grid
@@ -395,3 +396,4 @@ class Alignment:
     versions: Mapping[str, str] = field(default_factory=dict)
     timings_s: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+    masks: tuple[MaskUse, ...] = ()

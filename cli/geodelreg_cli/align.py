@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geodelreg.errors import AlignmentRefusedError, UsageError
+from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
@@ -42,6 +43,9 @@ Examples:
 
   One file per band, one correction for all of them; OUT is a folder:
     geodelreg align B2.tif B3.tif B4.tif B8.tif -o aligned/
+
+  Leave out the clouds that the Landsat quality band knows of:
+    geodelreg align ms.tif pan.tif -o aligned.tif --mask LC08_..._QA_PIXEL.TIF
 
   Also write the control points for QGIS and GDAL, a report and a figure:
     geodelreg align ms.tif pan.tif -o aligned.tif --gcps ms.points \\
@@ -196,7 +200,8 @@ def _check_outputs(request: Request) -> None:
     targets = [*rasters, *(path for path in side_files if path is not None)]
     _check_gcp_formats(request)
     created = request.output if len(request.sources) > 1 else None
-    inputs = [*request.sources, request.reference]
+    masks = (*request.options.masks, *request.options.pan_masks)
+    inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
         check_targets(inputs, targets, request.write_options.overwrite, created)
     except UsageError as error:

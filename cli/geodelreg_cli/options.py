@@ -26,12 +26,17 @@ TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": cl
 # Flags that GDAL's users know by another name than the knob's.
 FLAGS = {
     "band": ("-b", "--band"),
+    "masks": ("--mask",),
+    "pan_masks": ("--pan-mask",),
     "threads": ("-j", "--num-threads"),
     "driver": ("--of",),
     "creation_options": ("--co",),
     "warp_grid": ("--grid",),
     "resampling": ("-r", "--resampling"),
 }
+
+# What follows a flag that may be repeated, unless it is KEY=VALUE.
+METAVARS = {"masks": "FILE[=HIDE]", "pan_masks": "FILE[=HIDE]"}
 
 
 class NumberOr(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
@@ -123,7 +128,8 @@ def _kind(field: Field[Any]) -> dict[str, Any]:
     if kind == "bool":
         return {"is_flag": True, "default": field.default}
     if kind.startswith("tuple"):
-        return {"multiple": True, "default": field.default, "metavar": "KEY=VALUE"}
+        metavar = METAVARS.get(field.name, "KEY=VALUE")
+        return {"multiple": True, "default": field.default, "metavar": metavar}
     if field.name in WORDS:
         word = WORDS[field.name]
         return {"type": word, "default": word.word, "show_default": True, "metavar": word.name}

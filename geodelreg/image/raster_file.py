@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 
 from geodelreg.errors import RasterUnreadableError
+from geodelreg.geo.grid import decimated_grid
 from geodelreg.image.decimate import BoxAverage
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
+from geodelreg.image.quality import quality_bands
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
-from geodelreg.types import BoolArray, Float32Array, Window
+from geodelreg.types import BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -45,7 +48,12 @@ class RasterFile:
     ----------
     grid : Grid
     image_bands : tuple of int
-        1-based numbers of the bands that are not alpha.
+        1-based numbers of the bands that are neither alpha nor quality bands.
+    quality_bands : dict of int to str
+        Numbers and kinds of the bands that say how good the others are.
+    hides : callable or None
+        Takes a `Grid` that is part of this raster's and gives (H, W) bool, True for the pixels
+        that are to be invalid whatever the file says.
 
     Raises
     ------
@@ -62,7 +70,10 @@ class RasterFile:
         self._alpha = alpha_bands(self.dataset)
         if len(self._alpha) == len(every):
             self._alpha = ()
-        self.image_bands = tuple(number for number in every if number not in self._alpha)
+        self.quality_bands = quality_bands(path, self.dataset.descriptions)
+        self.hides: Callable[[Grid], BoolArray] | None = None
+        known = {*self._alpha, *self.quality_bands}
+        self.image_bands = tuple(number for number in every if number not in known)
         self._placements: dict[int, Placement] = {}
 
     @cached_property
@@ -116,7 +127,7 @@ class RasterFile:
         ------
         RasterUnreadableError
         """
-        data, valid = self._pixels(numbers, window, self.dataset)
+        data, valid = self._shown(numbers, window, self.dataset, Placement((1.0, 1.0)))
         return data, np.ones(data.shape, dtype=np.bool_) if valid is None else valid
 
     def read_decimated(
@@ -133,8 +144,28 @@ class RasterFile:
         origin, size = placement.area(window)
         average = BoxAverage(len(numbers), shape, origin, size)
         for piece in _pieces(dataset, origin, size, len(numbers)):
-            average.add(*self._pixels(numbers, piece, dataset), piece.column, piece.row)
+            shown = self._shown(numbers, piece, dataset, placement)
+            average.add(*shown, piece.column, piece.row)
         return average.result()
+
+    def _shown(
+        self, numbers: Sequence[int], window: Window, level: DatasetReader, placement: Placement
+    ) -> tuple[Float32Array, BoolArray | None]:
+        """`_pixels` without those that a mask hides."""
+        data, valid = self._pixels(numbers, window, level)
+        if self.hides is None:
+            return data, valid
+        (across, down), (x, y) = placement
+        place = Affine.scale(1 / across, 1 / down) @ Affine.translation(x, y)
+        grid = Grid(self.grid.transform @ place, (level.height, level.width), self.grid.crs_wkt)
+        hidden = self.hides(decimated_grid(grid, window))
+        if not hidden.any():
+            return data, valid
+        data[:, hidden] = 0
+        if valid is None:
+            valid = np.ones(data.shape, dtype=np.bool_)
+        valid[:, hidden] = False
+        return data, valid
 
     def _placement(self, overview: int) -> Placement:
         """Where an overview's pixels lie, found on first use."""

@@ -28,6 +28,7 @@ from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window
 if TYPE_CHECKING:
     from os import PathLike
 
+    from geodelreg.image.masks import Masks
 
 logger = logging.getLogger(__name__)
 
@@ -52,19 +53,23 @@ class RasterReader:
     paths : tuple of str
         Files that hold the bands.
     other_paths : tuple of str
-        Files given with them that lie on another grid: a correction applies to them, too.
+        Files given with them that lie on another grid, or are masks of the others: a correction
+        applies to them, too.
+    masks : Masks or None
+        What hides pixels beyond what the files themselves say; None when nothing does.
     """
 
-    def __init__(self, paths: Sequence[str]) -> None:
+    def __init__(self, paths: Sequence[str], masks: Sequence[str] | None = None) -> None:
         if not paths:
             raise UsageError("no raster file was named", "Give at least one.")
         self._lock = threading.Lock()
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
             files = [RasterFile(path, stack) for path in paths]
-            self._files = _on_the_common_grid(files)
+            self._files = _on_the_common_grid(_with_image_bands(files))
+            self.paths = tuple(file.path for file in self._files)
+            self.masks = self._open_masks(files, masks, stack)
             self._stack = stack.pop_all()
-        self.paths = tuple(file.path for file in self._files)
         self.other_paths = tuple(file.path for file in files if file not in self._files)
         self._bands = _list_bands(self._files)
         self._decimations = self._common_decimations()
@@ -98,7 +103,7 @@ class RasterReader:
 
     @property
     def band_names(self) -> tuple[str, ...]:
-        """One name per image band (alpha is not one); band numbers are positions in it, from 1."""
+        """One name per image band, in the order of band numbers; masks and alpha are none."""
         return tuple(band.name for band in self._bands)
 
     @property
@@ -163,7 +168,28 @@ class RasterReader:
                 numbers = [band.number for band in stored]
                 data, valid = self._read_file(self._files[index], numbers, window, grid.shape)
                 planes.update(zip(stored, zip(data, valid, strict=True), strict=True))
+        if self.masks is not None:
+            self.masks.stop_counting()
         return [Band(*planes[band], grid, band.name) for band in wanted]
+
+    def _open_masks(
+        self, files: list[RasterFile], names: Sequence[str] | None, stack: ExitStack
+    ) -> Masks | None:
+        """The masks named, and the quality bands of the files."""
+        bands = [
+            (file.path, number, kind)
+            for file in files
+            for number, kind in file.quality_bands.items()
+            if number not in file.image_bands
+        ]
+        if names is None or not (names or bands):
+            return None
+        from geodelreg.image.masks import Masks
+
+        masks = Masks(self.grid, self.name, names, bands, stack)
+        for file in self._files:
+            file.hides = masks.hides
+        return masks
 
     def _check_window(self, window: Window, shape: tuple[int, int] | None) -> None:
         height, width = self.grid.shape
@@ -202,6 +228,14 @@ class RasterReader:
 
 def _storage(band: _FileBand) -> tuple[int, int]:
     return band.file, band.number
+
+
+def _with_image_bands(files: list[RasterFile]) -> list[RasterFile]:
+    """Files that show something; of nothing but quality bands, their bands are the image."""
+    showing = [file for file in files if file.image_bands]
+    for file in [] if showing else files:
+        file.image_bands = tuple(file.quality_bands)
+    return showing or files
 
 
 def _on_the_common_grid(files: list[RasterFile]) -> list[RasterFile]:
@@ -254,7 +288,9 @@ def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
     return bands
 
 
-def open_raster(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> RasterReader:
+def open_raster(
+    path: str | PathLike[str] | Sequence[str | PathLike[str]], masks: Sequence[str] | None = None
+) -> RasterReader:
     """Open an image for reading: one file, or one file per band.
 
     Of several files, those on the grid that most of them share hold the bands (on a tie the
@@ -264,6 +300,9 @@ def open_raster(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> Ra
     ----------
     path : path or sequence of paths
         Anything GDAL opens; URLs and ``/vsi…`` paths are passed to it as they are.
+    masks : sequence of str, optional
+        Masks of the image, ``FILE`` or ``FILE=HIDE``.  Bands and files that are called QA_PIXEL or
+        SCL are masks of the others without being named.  None: nothing is masked.
 
     Returns
     -------
@@ -278,9 +317,11 @@ def open_raster(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> Ra
         If a file does not say where it lies, or not through a geotransform.
     BandGridError
         If the files' CRSs differ.
+    MaskError, MissingExtraError
+        If a mask cannot be used.
     """
     paths = [path] if isinstance(path, str) or hasattr(path, "__fspath__") else list(path)
-    return RasterReader([str(one) for one in paths])
+    return RasterReader([str(one) for one in paths], masks)
 
 
 def check_band(reader: RasterReader, number: int) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from geodelreg.product.motion import header_motion
-from geodelreg.product.report import accuracy_line, json_text, plain, report_dict, short
+from geodelreg.product.report import accuracy_line, json_text, masks_line, plain, report_dict, short
 from geodelreg.types import Alignment, CheckOutcome, Misalignment
 
 _UNKNOWN = float("nan")
@@ -158,6 +158,8 @@ def check_text(check: Check) -> str:
     if check.alignment.verdict.accepted:
         lines += [_motion_line(check), _local_line(check)]
         lines.append(accuracy_line(check.alignment))
+    if check.alignment.masks:
+        lines.append(masks_line(check.alignment))
     if check.bands is not None:
         lines += ["", *_band_lines(check.bands)]
     return "\n".join(lines)

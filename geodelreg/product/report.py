@@ -17,7 +17,7 @@ from geodelreg.product.motion import HeaderMotion, header_motion
 from geodelreg.product.provenance import input_fingerprints, source_date
 from geodelreg.types import Alignment, Correction, Grid, Outcome, Status, TiePoints
 
-SCHEMA_VERSION = "1.1"
+SCHEMA_VERSION = "1.2"
 
 
 def report_schema() -> dict[str, Any]:
@@ -63,6 +63,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         ],
         "accuracy": asdict(alignment.accuracy),
         "band_weights": dict(alignment.band_weights),
+        "masks": [asdict(use) for use in alignment.masks],
         "verdict": {
             "outcome": alignment.verdict.outcome.value,
             "accepted": alignment.verdict.accepted,
@@ -165,7 +166,8 @@ def summary_text(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.REFUSED:
         lines = _refused_lines(alignment)
     else:
-        lines = [_found_line(alignment), accuracy_line(alignment), _next_line(alignment)]
+        lines = [_found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
+        lines.append(_next_line(alignment))
     return "\n".join(line for line in lines if line)
 
 
@@ -208,6 +210,17 @@ def accuracy_line(alignment: Alignment) -> str:
     return text + "."
 
 
+def masks_line(alignment: Alignment) -> str:
+    """Which masks were used and how much each hides; empty without any."""
+    images = {"source": "MS", "reference": "PAN"}
+    used = [
+        f"{Path(use.path).name} ({use.kind}) {short(100 * use.hidden_share)} % of "
+        + images[use.image]
+        for use in alignment.masks
+    ]
+    return f"Masks hide: {', '.join(used)}." if used else ""
+
+
 def _next_line(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
@@ -227,11 +240,12 @@ def _refused_lines(alignment: Alignment) -> list[str]:
     failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
     tips = (
         "Next: see that both rasters show the same ground; widen --search-radius when the header "
-        "is further off; try --band with the band that looks most like PAN; mask clouds and water."
+        "is further off; try --band with the band that looks most like PAN; mask clouds (--mask)."
     )
     return [
         "Refused: the images do not support an alignment; the header stays as it is.",
         *(f"  - {message}" for message in failed),
+        masks_line(alignment),
         tips,
     ]
 

@@ -1,0 +1,305 @@
+"""Raster masks on any grid: a pixel of the image is hidden when a hiding mask pixel touches it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.errors import GeodelregError, MaskError, MissingCrsError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.crs import crs_operation, map_points
+from geodelreg.geo.grid import decimated_grid
+from geodelreg.geo.pixel import pixel_centres
+from geodelreg.image.environment import gdal_calls
+from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.image.quality import (
+    hidden_values,
+    impossible_values,
+    is_old_landsat,
+    quality_bands,
+)
+from geodelreg.image.validity import alpha_bands
+from geodelreg.masking import AUTO, BINARY, LANDSAT_QA, MASK_KINDS, SENTINEL2_SCL, MaskSpec
+from geodelreg.types import BoolArray, FloatArray, Grid, IntArray, Window
+
+_TOUCH_PX = 1e-3
+"""Mask pixels that reach into an image pixel by less do not touch it: geotransforms are rounded."""
+
+_NODE_STEP_PX = 32
+_BLOCK_PX = 1_000_000
+_MASK_BLOCK_PX = 4_000_000
+_LATTICE = 128
+_SAMPLES_PER_AXIS = 4
+_SAMPLE_PX = 128
+_MOST_IMPOSSIBLE = 0.01
+
+
+class RasterMask:
+    """A raster that says which pixels of an image to leave out.
+
+    Parameters
+    ----------
+    spec : MaskSpec
+    image : Grid
+        Of the image; a mask of its size that does not say where it lies lies there, too.
+    stack : ExitStack
+        Closes the file.
+    band : int, optional
+        Number of the mask's band; the only one when not given.
+
+    Attributes
+    ----------
+    kind : str
+        ``binary``, ``values``, ``landsat-qa`` or ``sentinel2-scl``.
+    band : int
+    covered_share : float
+        Share of the image that lies on the mask, 0 to 1.
+
+    Raises
+    ------
+    MaskError
+        If the file cannot be read, is no mask of this kind, or lies elsewhere.
+    """
+
+    def __init__(
+        self, spec: MaskSpec, image: Grid, stack: ExitStack, band: int | None = None
+    ) -> None:
+        self.path = spec.path
+        self._hide = spec.hide
+        try:
+            self._dataset = stack.enter_context(open_dataset(spec.path))
+        except GeodelregError as error:
+            raise MaskError(f"the mask {error.cause}", _remedy(spec.path, error)) from error
+        self.band = band or _only_band(spec.path, self._dataset)
+        self.kind = self._kind_of(spec.kind)
+        self._nodata = self._dataset.nodatavals[self.band - 1]
+        self._grid = _grid_of(spec.path, self._dataset, image)
+        self.covered_share = _covered_share(image, self._grid)
+        if not self.covered_share:
+            raise MaskError(
+                f"the mask {spec.path} does not cover the image at any place",
+                "Give the mask of this image; if it is, correct its geotransform or CRS.",
+            )
+        if self.kind in (LANDSAT_QA, SENTINEL2_SCL):
+            self._check_values()
+
+    def hides(self, grid: Grid) -> BoolArray:
+        """(H, W) bool, True for the pixels of `grid` that are to be left out.
+
+        Raises
+        ------
+        MaskError
+            If a block of the mask cannot be decoded.
+        """
+        out = np.zeros(grid.shape, dtype=np.bool_)
+        for window in _blocks(grid, self._grid):
+            rows = slice(window.row, window.row + window.height)
+            columns = slice(window.column, window.column + window.width)
+            out[rows, columns] = self._hidden_block(decimated_grid(grid, window))
+        return out
+
+    def _hidden_block(self, grid: Grid) -> BoolArray:
+        shape = self._grid.shape
+        left, right, top, bottom = _touched(grid, self._grid)
+        left, right = (np.clip(edge, 0, shape[1]) for edge in (left, right))
+        top, bottom = (np.clip(edge, 0, shape[0]) for edge in (top, bottom))
+        x, y = int(left.min()), int(top.min())
+        width, height = int(right.max()) - x, int(bottom.max()) - y
+        hidden = np.zeros(grid.shape, dtype=np.bool_)
+        if min(width, height) < 1:
+            return hidden
+        stored = self._stored(Window(x, y, width, height))
+        there = hidden_values(stored, self.kind, self._hide, self._nodata)
+        if there.any():
+            total = np.zeros((height + 1, width + 1), dtype=np.int32)
+            np.cumsum(there, axis=0, dtype=np.int32, out=total[1:, 1:])
+            np.cumsum(total, axis=1, out=total)
+            left, right, top, bottom = left - x, right - x, top - y, bottom - y
+            count = total[bottom, right] - total[top, right]
+            count -= total[bottom, left] - total[top, left]
+            hidden[:] = count > 0
+        return hidden
+
+    def _stored(self, window: Window) -> NDArray[Any]:
+        from rasterio.errors import RasterioError
+
+        area = (
+            (window.row, window.row + window.height),
+            (window.column, window.column + window.width),
+        )
+        try:
+            with gdal_calls():
+                return np.asarray(self._dataset.read(self.band, window=area))
+        except (RasterioError, OSError, MemoryError, ValueError) as error:
+            reason = " ".join(str(error.__cause__ or error).split())
+            raise MaskError(
+                f"the mask {self.path} cannot be decoded ({reason})",
+                "The file is truncated or damaged: copy or download it again.",
+            ) from error
+
+    def _kind_of(self, asked: str) -> str:
+        if asked != AUTO:
+            return asked
+        descriptions = self._dataset.descriptions
+        name = PurePath(self.path).stem
+        if is_old_landsat(name) or is_old_landsat(descriptions[self.band - 1] or ""):
+            raise MaskError(
+                f"the mask {self.path} is a Landsat quality band from before Collection 2, whose "
+                "bits mean other things",
+                f"Take QA_PIXEL of Collection 2, or list the values to hide: {self.path}=2800,6896",
+            )
+        return quality_bands(self.path, descriptions).get(self.band, BINARY)
+
+    def _check_values(self) -> None:
+        """Look at samples all over the band for values that the producer does not write."""
+        height, width = self._grid.shape
+        found, absurd, example = 0, 0, 0.0
+        for y in _starts(height):
+            for x in _starts(width):
+                size = min(_SAMPLE_PX, width - x), min(_SAMPLE_PX, height - y)
+                stored = self._stored(Window(x, y, *size))
+                bad = impossible_values(stored, self.kind, self._nodata)
+                found, absurd = found + bad.size, absurd + int(bad.sum())
+                if bad.any():
+                    example = float(stored[bad][0])
+        if absurd > _MOST_IMPOSSIBLE * found:
+            band = {LANDSAT_QA: "QA_PIXEL of Landsat Collection 2", SENTINEL2_SCL: "Sentinel-2 SCL"}
+            raise MaskError(
+                f"the mask {self.path} (band {self.band}) holds values that {band[self.kind]} "
+                f"does not know, such as {example:g}: it is from another product or collection, or "
+                "was interpolated",
+                f"List the values to hide, e.g. {self.path}=3,8-10, or say {self.path}={BINARY}.",
+            )
+
+
+def _remedy(path: str, error: GeodelregError) -> str:
+    if "=" in path:
+        return f"After = come values (3,8-10) or one of {', '.join(MASK_KINDS)}; else check it."
+    return error.remedy
+
+
+def _only_band(path: str, dataset: Any) -> int:
+    with gdal_calls():
+        others = alpha_bands(dataset)
+    bands = [number for number in range(1, dataset.count + 1) if number not in others]
+    quality = quality_bands(path, dataset.descriptions)
+    if len(bands) > 1 and len(quality) == 1:
+        return next(iter(quality))
+    if len(bands) > 1:
+        raise MaskError(
+            f"the mask {path} has {len(bands)} bands, none of which is called QA_PIXEL or SCL",
+            "A mask has one: write it to a file of its own (gdal_translate -b N).",
+        )
+    return bands[0] if bands else 1
+
+
+def _grid_of(path: str, dataset: Any, image: Grid) -> Grid:
+    """Grid of a mask; that of the image when it has its size and says nothing else."""
+    try:
+        return dataset_grid(path, dataset)
+    except GeodelregError as error:
+        own = dataset.transform
+        same_place = not isinstance(error, MissingCrsError) or own.almost_equals(image.transform)
+        if (dataset.height, dataset.width) == image.shape and same_place:
+            return image
+        raise MaskError(
+            f"the mask {error.cause}, and it does not have the size of the image",
+            error.remedy or "Give a mask that says where it lies.",
+        ) from error
+
+
+def _covered_share(image: Grid, mask: Grid) -> float:
+    """Share of a lattice over the image that lies on the mask; above 0 when they only meet."""
+    share = _share_inside(image, mask)
+    return share or min(_share_inside(mask, image), 1 / _LATTICE**2)
+
+
+def _share_inside(one: Grid, other: Grid) -> float:
+    axis = pixel_centres(np.arange(_LATTICE)) / _LATTICE
+    columns, rows = np.meshgrid(axis * one.shape[1], axis * one.shape[0])
+    there = _to_mask(np.stack([columns, rows], axis=-1), one, other)
+    with np.errstate(invalid="ignore"):
+        inside = (there >= 0) & (there <= np.array(other.shape[::-1]))
+    return float(inside.all(axis=-1).mean())
+
+
+def _to_mask(px: FloatArray, image: Grid, mask: Grid) -> FloatArray:
+    """(..., 2) image pixels to mask pixels, exactly; NaN where there is no way."""
+    ground = map_points(apply_affine(image.transform, px), image.crs_wkt, mask.crs_wkt)
+    return apply_affine(~mask.transform, ground)
+
+
+def _starts(length: int) -> list[int]:
+    """Where samples along an axis begin, each once."""
+    last = max(length - _SAMPLE_PX, 0)
+    return sorted({last * i // (_SAMPLES_PER_AXIS - 1) for i in range(_SAMPLES_PER_AXIS)})
+
+
+def _blocks(grid: Grid, mask: Grid) -> Iterator[Window]:
+    """Parts of an image window that touch a bounded number of mask pixels."""
+    height, width = grid.shape
+    step = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    ends = _to_mask(np.array([width, height]) / 2 + step, grid, mask)
+    (a, b), (c, d) = ends[1] - ends[0], ends[2] - ends[0]
+    ratio = (abs(a) + abs(c)) * (abs(b) + abs(d))
+    limit = min(_BLOCK_PX, _MASK_BLOCK_PX / ratio) if ratio > 0 else _BLOCK_PX
+    across = int(np.clip(limit, 1, width))
+    down = int(np.clip(limit // across, 1, height))
+    for row in range(0, height, down):
+        for column in range(0, width, across):
+            yield Window(column, row, min(across, width - column), min(down, height - row))
+
+
+def _touched(grid: Grid, mask: Grid) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Mask pixels that each image pixel touches: first column and the one after the last, rows too.
+
+    The box around the pixel is taken where the grids are turned against each other.  Arrays
+    broadcast to the image's shape.
+    """
+    height, width = grid.shape
+    relative = ~mask.transform @ grid.transform
+    same_crs = not crs_operation(grid.crs_wkt, mask.crs_wkt).description
+    if same_crs and max(abs(relative.b) * height, abs(relative.d) * width) < _TOUCH_PX:
+        x = relative.a * np.arange(width + 1.0)[None, :] + relative.c
+        y = relative.e * np.arange(height + 1.0)[:, None] + relative.f
+        sides = (x[:, :-1], x[:, 1:]), (y[:-1], y[1:])
+        boxes = [(np.minimum(*side), np.maximum(*side)) for side in sides]
+    else:
+        boxes = []
+        for at in np.moveaxis(_corners(grid, mask), -1, 0):
+            four = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
+            boxes.append((np.minimum.reduce(four), np.maximum.reduce(four)))
+    (left, right), (top, bottom) = (_whole(low, high) for low, high in boxes)
+    return left, right, top, bottom
+
+
+def _whole(low: FloatArray, high: FloatArray) -> tuple[IntArray, IntArray]:
+    """First pixel that an interval touches, and the one after the last; none for NaN."""
+    # far outside any raster, but not outside the integers
+    low, high = (np.clip(np.nan_to_num(edge, nan=-1e9), -1e9, 1e9) for edge in (low, high))
+    first = np.floor(low + _TOUCH_PX).astype(np.intp)
+    return first, np.maximum(np.ceil(high - _TOUCH_PX).astype(np.intp), first + 1)
+
+
+def _corners(grid: Grid, mask: Grid) -> FloatArray:
+    """(H + 1, W + 1, 2) mask pixels at the corners of the image's, bilinear between nodes."""
+    rows, columns = (_nodes(side) for side in grid.shape)
+    nodes = _to_mask(np.stack(np.meshgrid(columns, rows), axis=-1), grid, mask)
+    y, x = (np.arange(side + 1.0) for side in grid.shape)
+    return _between(_between(nodes, rows, y).swapaxes(0, 1), columns, x).swapaxes(0, 1)
+
+
+def _nodes(side: int) -> FloatArray:
+    return np.linspace(0.0, side, -(-side // _NODE_STEP_PX) + 1)
+
+
+def _between(values: FloatArray, nodes: FloatArray, at: FloatArray) -> FloatArray:
+    """Linear interpolation along the first axis."""
+    first = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    share = ((at - nodes[first]) / (nodes[first + 1] - nodes[first]))[:, None, None]
+    return np.asarray(values[first] * (1 - share) + values[first + 1] * share)

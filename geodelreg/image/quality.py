@@ -1,0 +1,141 @@
+"""Quality bands: what the values of a mask mean, and bands that are one by their name.
+
+Landsat Collection 2 ``QA_PIXEL`` (USGS LSDS-1619, table 6-2) has a bit for each finding and two
+bits for the confidence in some of them; the pattern 10 is used for clouds only.  Sentinel-2 ``SCL``
+(Level-2A algorithm overview, ESA) is a class from 0 to 11.
+
+Only what is not the ground is hidden: fill, clouds and their shadows.  Snow and water are ground
+that lies still between the two images; where they show nothing nothing is matched anyway.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geodelreg.masking import BINARY, LANDSAT_QA, SENTINEL2_SCL, VALUES, Ranges
+from geodelreg.types import BoolArray
+
+
+def _word(pattern: str) -> re.Pattern[str]:
+    return re.compile(rf"(?:^|[^A-Z0-9])(?:{pattern})(?:$|[^A-Z0-9])", re.IGNORECASE)
+
+
+_NAMES = {LANDSAT_QA: _word("QA_PIXEL"), SENTINEL2_SCL: _word("SCL")}
+_OLD_LANDSAT = _word("BQA|PIXEL_QA")
+
+# fill, dilated cloud, cirrus, cloud, cloud shadow
+_LANDSAT_HIDDEN = 0b11111
+_FILL, _CIRRUS, _CLOUD, _SHADOW, _SNOW = (1 << bit for bit in (0, 2, 3, 4, 5))
+# no data, saturated or defective, cloud shadow, cloud (medium and high probability), thin cirrus
+_SCL_HIDDEN = (0, 1, 3, 8, 9, 10)
+_SCL_LAST = 11
+
+
+def quality_kind(name: str) -> str | None:
+    """Kind of quality band that a file name (without folders) or a band's description tells of."""
+    return next((kind for kind, pattern in _NAMES.items() if pattern.search(name)), None)
+
+
+def is_old_landsat(name: str) -> bool:
+    """Whether a file or band name is that of a quality band before Collection 2."""
+    return _OLD_LANDSAT.search(name) is not None
+
+
+def quality_bands(path: str, descriptions: tuple[str | None, ...]) -> dict[int, str]:
+    """Numbers (from 1) and kinds of the bands of a raster that are quality bands.
+
+    A band's description says so, or the file's name when there is but one band.
+    """
+    kinds = {n: quality_kind(text or "") for n, text in enumerate(descriptions, start=1)}
+    if len(descriptions) == 1 and kinds[1] is None:
+        kinds[1] = quality_kind(PurePath(path).stem)
+    return {number: kind for number, kind in kinds.items() if kind is not None}
+
+
+def hidden_values(
+    raw: NDArray[Any], kind: str, hide: Ranges = (), nodata: float | None = None
+) -> BoolArray:
+    """Where a mask's values hide a pixel.
+
+    Parameters
+    ----------
+    raw : (H, W) of the mask's own type
+    kind : str
+        ``binary``, ``values``, ``landsat-qa`` or ``sentinel2-scl``.
+    hide : ranges of values
+        For ``values``.
+    nodata : float, optional
+        Of the mask; hides nothing in a ``binary`` one.
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    if kind == VALUES:
+        chosen = np.zeros(raw.shape, dtype=np.bool_)
+        for first, last in hide:
+            chosen |= (raw >= first) & (raw <= last)
+        return chosen
+    if kind == BINARY:
+        with np.errstate(invalid="ignore"):
+            return np.asarray((raw != 0) & (raw == raw) & ~_is_nodata(raw, nodata))
+    whole = _integers(raw)
+    if kind == LANDSAT_QA:
+        # 0 is in no product; crops and warps put it where they have nothing
+        return np.asarray((whole & _LANDSAT_HIDDEN != 0) | (whole == 0) | _is_nodata(raw, nodata))
+    return np.isin(whole, _SCL_HIDDEN) | _is_nodata(raw, nodata)
+
+
+def impossible_values(raw: NDArray[Any], kind: str, nodata: float | None = None) -> BoolArray:
+    """Where the values of a quality band are none that its producer writes.
+
+    Parameters
+    ----------
+    raw : (H, W) of the band's own type
+    kind : str
+        ``landsat-qa`` or ``sentinel2-scl``.
+    nodata : float, optional
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    whole = _integers(raw)
+    if kind == SENTINEL2_SCL:
+        absurd = (whole < 0) | (whole > _SCL_LAST)
+    else:
+        cloud, shadow, snow, cirrus = (whole >> shift & 3 for shift in (8, 10, 12, 14))
+        absurd = (shadow == 2) | (snow == 2) | (cirrus == 2)
+        absurd |= (whole & _CLOUD != 0) & (cloud < 2)
+        for flag, confidence in ((_SHADOW, shadow), (_SNOW, snow), (_CIRRUS, cirrus)):
+            absurd |= (whole & flag != 0) & (confidence != 3)
+        # how sure it is of a cloud, or of none, is stated wherever the sensor has seen anything
+        absurd |= (cloud == 0) & (whole != 0)
+        absurd &= whole & _FILL == 0
+        absurd |= (whole < 0) | (whole > 0xFFFF)
+    absurd |= _is_fractional(raw)
+    return np.asarray(absurd & ~_is_nodata(raw, nodata))
+
+
+def _integers(raw: NDArray[Any]) -> NDArray[np.int64]:
+    """Values as integers, which exports may have stored as floats; NaN becomes 0."""
+    if raw.dtype.kind == "f":
+        raw = np.nan_to_num(raw, nan=0.0, posinf=-1.0, neginf=-1.0)
+    return np.asarray(raw, dtype=np.int64)
+
+
+def _is_fractional(raw: NDArray[Any]) -> BoolArray:
+    if raw.dtype.kind != "f":
+        return np.zeros(raw.shape, dtype=np.bool_)
+    return np.asarray(np.isfinite(raw) & (raw != np.rint(raw)))
+
+
+def _is_nodata(raw: NDArray[Any], nodata: float | None) -> BoolArray:
+    if nodata is None:
+        return np.zeros(raw.shape, dtype=np.bool_)
+    return np.asarray(raw == nodata)
