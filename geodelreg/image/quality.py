@@ -31,6 +31,7 @@ _OLD_LANDSAT = _word("BQA|PIXEL_QA")
 # fill, dilated cloud, cirrus, cloud, cloud shadow
 _LANDSAT_HIDDEN = 0b11111
 _FILL, _CIRRUS, _CLOUD, _SHADOW, _SNOW = (1 << bit for bit in (0, 2, 3, 4, 5))
+_MSS_BITS = _FILL | _CLOUD | 3 << 8
 # no data, saturated or defective, cloud shadow, cloud (medium and high probability), thin cirrus
 _SCL_HIDDEN = (0, 1, 3, 8, 9, 10)
 _SCL_LAST = 11
@@ -114,6 +115,8 @@ def impossible_values(raw: NDArray[Any], kind: str, nodata: float | None = None)
         absurd |= (whole & _CLOUD != 0) & (cloud < 2)
         for flag, confidence in ((_SHADOW, shadow), (_SNOW, snow), (_CIRRUS, cirrus)):
             absurd |= (whole & flag != 0) & (confidence != 3)
+        # without confidences in shadow and snow it is of the MSS, which knows of clouds only
+        absurd |= ((shadow == 0) | (snow == 0)) & (whole & ~_MSS_BITS != 0)
         # how sure it is of a cloud, or of none, is stated wherever the sensor has seen anything
         absurd |= (cloud == 0) & (whole != 0)
         absurd &= whole & _FILL == 0
