@@ -98,6 +98,7 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
         "MS_FINGERPRINT": "; ".join(source) if all(source) else "",
         "PAN": Path(alignment.reference_path).name,
         "PAN_FINGERPRINT": prints[alignment.reference_path],
+        "MASKS": "; ".join(f"{Path(use.path).name} ({use.kind})" for use in alignment.masks),
         "METHOD": alignment.options.method,
         "MODEL": correction.model,
         "VERDICT": alignment.verdict.outcome.value,

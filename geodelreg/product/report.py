@@ -214,9 +214,9 @@ def masks_line(alignment: Alignment) -> str:
     """Which masks were used and how much each hides; empty without any."""
     images = {"source": "MS", "reference": "PAN"}
     used = [
-        f"{Path(use.path).name} ({use.kind}) {short(100 * use.hidden_share)} % of "
-        + images[use.image]
+        f"{Path(use.path).name} ({use.kind}) {100 * use.hidden_share:.1f} % of {images[use.image]}"
         for use in alignment.masks
+        if math.isfinite(use.hidden_share)
     ]
     return f"Masks hide: {', '.join(used)}." if used else ""
 
