@@ -30,6 +30,7 @@ from geodelreg.types import BoolArray, FloatArray, Grid, IntArray, Window
 _TOUCH_PX = 1e-3
 """Mask pixels that reach into an image pixel by less do not touch it: geotransforms are rounded."""
 
+_FAR_PX = 1e9
 _NODE_STEP_PX = 32
 _BLOCK_PX = 1_000_000
 _MASK_BLOCK_PX = 4_000_000
@@ -104,26 +105,20 @@ class RasterMask:
         return out
 
     def _hidden_block(self, grid: Grid) -> BoolArray:
-        shape = self._grid.shape
-        left, right, top, bottom = _touched(grid, self._grid)
-        left, right = (np.clip(edge, 0, shape[1]) for edge in (left, right))
-        top, bottom = (np.clip(edge, 0, shape[0]) for edge in (top, bottom))
-        x, y = int(left.min()), int(top.min())
-        width, height = int(right.max()) - x, int(bottom.max()) - y
-        hidden = np.zeros(grid.shape, dtype=np.bool_)
+        columns, rows = _touched(grid, self._grid)
+        columns, rows = (
+            _clipped(*pair) for pair in zip((columns, rows), self._grid.shape[::-1], strict=True)
+        )
+        x, y = int(columns[0].min()), int(rows[0].min())
+        width, height = int(columns[1].max()) - x, int(rows[1].max()) - y
         if min(width, height) < 1:
-            return hidden
+            return np.zeros(grid.shape, dtype=np.bool_)
         stored = self._stored(Window(x, y, width, height))
         there = hidden_values(stored, self.kind, self._hide, self._nodata)
-        if there.any():
-            total = np.zeros((height + 1, width + 1), dtype=np.int32)
-            np.cumsum(there, axis=0, dtype=np.int32, out=total[1:, 1:])
-            np.cumsum(total, axis=1, out=total)
-            left, right, top, bottom = left - x, right - x, top - y, bottom - y
-            count = total[bottom, right] - total[top, right]
-            count -= total[bottom, left] - total[top, left]
-            hidden[:] = count > 0
-        return hidden
+        if not there.any():
+            return np.zeros(grid.shape, dtype=np.bool_)
+        (left, right), (top, bottom) = columns, rows
+        return _any_inside(there, left - x, right - x, top - y, bottom - y)
 
     def _stored(self, window: Window) -> NDArray[Any]:
         from rasterio.errors import RasterioError
@@ -255,11 +250,15 @@ def _blocks(grid: Grid, mask: Grid) -> Iterator[Window]:
             yield Window(column, row, min(across, width - column), min(down, height - row))
 
 
-def _touched(grid: Grid, mask: Grid) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Mask pixels that each image pixel touches: first column and the one after the last, rows too.
+Span = tuple[IntArray, IntArray]
+"""First pixel and the one after the last, along one axis."""
+
+
+def _touched(grid: Grid, mask: Grid) -> tuple[Span, Span]:
+    """Columns and rows of the mask that each image pixel touches.
 
     The box around the pixel is taken where the grids are turned against each other.  Arrays
-    broadcast to the image's shape.
+    broadcast to the image's shape: (1, W) and (H, 1) where they are not turned.
     """
     height, width = grid.shape
     relative = ~mask.transform @ grid.transform
@@ -268,38 +267,100 @@ def _touched(grid: Grid, mask: Grid) -> tuple[IntArray, IntArray, IntArray, IntA
         x = relative.a * np.arange(width + 1.0)[None, :] + relative.c
         y = relative.e * np.arange(height + 1.0)[:, None] + relative.f
         sides = (x[:, :-1], x[:, 1:]), (y[:-1], y[1:])
-        boxes = [(np.minimum(*side), np.maximum(*side)) for side in sides]
-    else:
-        boxes = []
-        for at in np.moveaxis(_corners(grid, mask), -1, 0):
-            four = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
-            boxes.append((np.minimum.reduce(four), np.maximum.reduce(four)))
-    (left, right), (top, bottom) = (_whole(low, high) for low, high in boxes)
-    return left, right, top, bottom
+        columns, rows = (_whole(np.minimum(*side), np.maximum(*side)) for side in sides)
+        return columns, rows
+    at_rows, at_columns = (_nodes(side) for side in grid.shape)
+    places = pixel_centres(np.stack(np.meshgrid(at_columns, at_rows), axis=-1))
+    columns, rows = (
+        _whole(*_boxes(nodes, at_rows, at_columns, grid.shape))
+        for nodes in np.moveaxis(_to_mask(places, grid, mask), -1, 0)
+    )
+    return columns, rows
 
 
-def _whole(low: FloatArray, high: FloatArray) -> tuple[IntArray, IntArray]:
-    """First pixel that an interval touches, and the one after the last; none for NaN."""
+def _boxes(
+    nodes: FloatArray, rows: FloatArray, columns: FloatArray, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Where image pixels begin and end along an axis of the mask.
+
+    Parameters
+    ----------
+    nodes : (R, C) float64
+        Mask pixels at the centres of some image pixels.
+    rows, columns : (R,) and (C,) float64
+        Which these are, the first and the last ones included.
+    shape : tuple of int
+        ``(height, width)`` of the image.
+
+    Returns
+    -------
+    low, high : (H, W) float64
+        Bilinear between nodes; far outside where there is no way.
+    """
+    height, width = shape
+    slopes = [
+        np.abs(np.diff(nodes, axis=axis)).ravel() / step
+        for axis, step in ((0, rows[1] - rows[0]), (1, columns[1] - columns[0]))
+    ]
+    reach = sum(float(np.nanmax(slope)) if np.isfinite(slope).any() else 0.0 for slope in slopes)
     # far outside any raster, but not outside the integers
-    low, high = (np.clip(np.nan_to_num(edge, nan=-1e9), -1e9, 1e9) for edge in (low, high))
+    bounded = np.clip(np.nan_to_num(nodes, nan=-_FAR_PX), -_FAR_PX, _FAR_PX)
+    wide = _between(bounded.T, columns, width)
+    centre = _between(np.ascontiguousarray(wide.T), rows, height)
+    low = centre - reach / 2
+    centre += reach / 2
+    return low, centre
+
+
+def _nodes(side: int) -> FloatArray:
+    """Indices of pixels, the first and the last included and at least two."""
+    last = max(side - 1, 1)
+    return np.linspace(0.0, last, -(-last // _NODE_STEP_PX) + 1)
+
+
+def _between(values: FloatArray, nodes: FloatArray, count: int) -> FloatArray:
+    """Linear interpolation along the first axis, at 0 to `count` - 1."""
+    at = np.arange(float(count))
+    first = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    share = ((at - nodes[first]) / (nodes[first + 1] - nodes[first]))[:, None]
+    low = np.take(values, first, axis=0)
+    step = np.take(np.diff(values, axis=0), first, axis=0)
+    step *= share
+    step += low
+    return step
+
+
+def _whole(low: FloatArray, high: FloatArray) -> Span:
+    """Pixels that intervals touch."""
     first = np.floor(low + _TOUCH_PX).astype(np.intp)
     return first, np.maximum(np.ceil(high - _TOUCH_PX).astype(np.intp), first + 1)
 
 
-def _corners(grid: Grid, mask: Grid) -> FloatArray:
-    """(H + 1, W + 1, 2) mask pixels at the corners of the image's, bilinear between nodes."""
-    rows, columns = (_nodes(side) for side in grid.shape)
-    nodes = _to_mask(np.stack(np.meshgrid(columns, rows), axis=-1), grid, mask)
-    y, x = (np.arange(side + 1.0) for side in grid.shape)
-    return _between(_between(nodes, rows, y).swapaxes(0, 1), columns, x).swapaxes(0, 1)
+def _clipped(span: Span, length: int) -> Span:
+    for edge in span:
+        np.clip(edge, 0, length, out=edge)
+    return span
 
 
-def _nodes(side: int) -> FloatArray:
-    return np.linspace(0.0, side, -(-side // _NODE_STEP_PX) + 1)
+def _any_inside(
+    there: BoolArray, left: IntArray, right: IntArray, top: IntArray, bottom: IntArray
+) -> BoolArray:
+    """Whether any pixel is True in boxes of columns and rows, the last ones not included."""
+    if left.shape[0] == 1 and top.shape[1] == 1:
+        across = _any_along(there.T, left[0], right[0]).T
+        return _any_along(across, top[:, 0], bottom[:, 0])
+    total = np.zeros((there.shape[0] + 1, there.shape[1] + 1), dtype=np.int32)
+    np.cumsum(there, axis=0, dtype=np.int32, out=total[1:, 1:])
+    np.cumsum(total, axis=1, out=total)
+    count = total[bottom, right] - total[top, right]
+    count -= total[bottom, left] - total[top, left]
+    return np.asarray(count > 0)
 
 
-def _between(values: FloatArray, nodes: FloatArray, at: FloatArray) -> FloatArray:
-    """Linear interpolation along the first axis."""
-    first = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
-    share = ((at - nodes[first]) / (nodes[first + 1] - nodes[first]))[:, None, None]
-    return np.asarray(values[first] * (1 - share) + values[first + 1] * share)
+def _any_along(there: BoolArray, first: IntArray, stop: IntArray) -> BoolArray:
+    """The same along the first axis alone."""
+    if (stop == first + 1).all():
+        return np.take(there, first, axis=0)
+    total = np.zeros((there.shape[0] + 1, there.shape[1]), dtype=np.int32)
+    np.cumsum(there, axis=0, dtype=np.int32, out=total[1:])
+    return np.asarray(np.take(total, stop, axis=0) > np.take(total, first, axis=0))

@@ -87,9 +87,13 @@ def hidden_values(
             return np.asarray((raw != 0) & (raw == raw) & ~_is_nodata(raw, nodata))
     whole = _integers(raw)
     if kind == LANDSAT_QA:
-        # 0 is in no product; crops and warps put it where they have nothing
-        return np.asarray((whole & _LANDSAT_HIDDEN != 0) | (whole == 0) | _is_nodata(raw, nodata))
-    return np.isin(whole, _SCL_HIDDEN) | _is_nodata(raw, nodata)
+        hidden = (whole & _LANDSAT_HIDDEN).astype(np.bool_)
+        hidden |= whole == 0  # in no product; crops and warps put it where they have nothing
+    else:
+        hidden = np.logical_or.reduce([whole == value for value in _SCL_HIDDEN])
+    if nodata is not None:
+        hidden |= _is_nodata(raw, nodata)
+    return np.asarray(hidden)
 
 
 def impossible_values(raw: NDArray[Any], kind: str, nodata: float | None = None) -> BoolArray:
@@ -106,7 +110,7 @@ def impossible_values(raw: NDArray[Any], kind: str, nodata: float | None = None)
     -------
     (H, W) bool
     """
-    whole = _integers(raw)
+    whole = _integers(raw).astype(np.int64)
     if kind == SENTINEL2_SCL:
         absurd = (whole < 0) | (whole > _SCL_LAST)
     else:
@@ -125,11 +129,11 @@ def impossible_values(raw: NDArray[Any], kind: str, nodata: float | None = None)
     return np.asarray(absurd & ~_is_nodata(raw, nodata))
 
 
-def _integers(raw: NDArray[Any]) -> NDArray[np.int64]:
+def _integers(raw: NDArray[Any]) -> NDArray[Any]:
     """Values as integers, which exports may have stored as floats; NaN becomes 0."""
-    if raw.dtype.kind == "f":
-        raw = np.nan_to_num(raw, nan=0.0, posinf=-1.0, neginf=-1.0)
-    return np.asarray(raw, dtype=np.int64)
+    if raw.dtype.kind != "f":
+        return raw
+    return np.asarray(np.nan_to_num(raw, nan=0.0, posinf=-1.0, neginf=-1.0), dtype=np.int64)
 
 
 def _is_fractional(raw: NDArray[Any]) -> BoolArray:
