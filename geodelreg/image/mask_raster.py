@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.errors import GeodelregError, MaskError, MissingCrsError
+from geodelreg.errors import CrsTransformError, GeodelregError, MaskError, MissingCrsError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
@@ -80,7 +80,12 @@ class RasterMask:
         self.kind = self._kind_of(spec.kind)
         self._nodata = self._dataset.nodatavals[self.band - 1]
         self._grid = _grid_of(spec.path, self._dataset, image)
-        self.covered_share = _covered_share(image, self._grid)
+        try:
+            self.covered_share = _covered_share(image, self._grid)
+        except CrsTransformError as error:
+            raise MaskError(
+                f"the mask {spec.path} cannot be put on the image: {error.cause}", error.remedy
+            ) from error
         if not self.covered_share:
             raise MaskError(
                 f"the mask {spec.path} does not cover the image at any place",

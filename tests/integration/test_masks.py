@@ -495,6 +495,10 @@ def broken_masks(write_raster: WriteRaster, folder: Path) -> dict[str, tuple[obj
             write_raster("nocrs.tif", values, crs=None, transform=far),
             "no coordinate reference system, and it does not", "gdal_edit.py -a_srs",
         ),
+        "a CRS without a place": (
+            write_raster("site.tif", values, crs='LOCAL_CS["site",UNIT["metre",1]]'),
+            "site.tif cannot be put on the image", "CRS",
+        ),
         "many bands": (write_raster("rgb.tif", land()), "has 2 bands", "gdal_translate -b"),
         "Collection 1 called QA_PIXEL": (
             write_raster("x_QA_PIXEL.tif", qa), "such as 2720: it is from another", "=3,8-10",
