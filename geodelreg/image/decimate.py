@@ -2,9 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from geodelreg.types import BoolArray, Float32Array, FloatArray, IntArray
+
+
+class Share(NamedTuple):
+    """What a piece adds to the cells of a coarser grid.
+
+    Attributes
+    ----------
+    cells : tuple of slice
+        Rows and columns.
+    total : (B, h, w) float32
+        Sums over the piece's pixels.
+    area : (B, h, w) or (1, h, w) float
+        Numbers of valid pixels; one plane serves all bands.
+    """
+
+    cells: tuple[slice, slice]
+    total: Float32Array
+    area: Float32Array | FloatArray
 
 
 class BoxAverage:
@@ -39,10 +59,14 @@ class BoxAverage:
         self._ratio = (size[0] / width, size[1] / height)
         self._counts = (width, height)
         self._sum = np.zeros((bands, height, width))
-        self._area = np.zeros((bands, height, width))
+        self._area = np.zeros((1, height, width))
 
     def add(self, data: Float32Array, valid: BoolArray | None, column: int, row: int) -> None:
-        """Add the piece whose upper-left pixel is (`column`, `row`) of the finer raster.
+        """Add a piece; parameters as of `share`."""
+        self.take(self.share(data, valid, column, row))
+
+    def share(self, data: Float32Array, valid: BoolArray | None, column: int, row: int) -> Share:
+        """What the piece whose upper-left pixel is (`column`, `row`) adds; threads may ask.
 
         Parameters
         ----------
@@ -51,26 +75,34 @@ class BoxAverage:
         valid : (B, h, w) bool or None
             None stands for all valid.
         column, row : int
+            In pixels of the finer raster.
         """
         rows = _Cells(row, data.shape[1], self._origin[1], self._ratio[1], self._counts[1])
         columns = _Cells(column, data.shape[2], self._origin[0], self._ratio[0], self._counts[0])
-        target = (slice(None), rows.cells, columns.cells)
         if valid is None:
             total = columns.fold(rows.fold(data, None, 1), None, 2)
-            self._area[target] += np.multiply.outer(rows.areas(), columns.areas())
-        else:
-            share = valid.astype(np.float32)
-            row_area = rows.fold(share, None, 1, constant=True)
-            total = columns.fold(rows.fold(data, share, 1), row_area, 2)
-            self._area[target] += columns.fold(row_area, None, 2, constant=True)
-        self._sum[target] += total
+            area = np.multiply.outer(rows.areas(), columns.areas())[None]
+            return Share((rows.cells, columns.cells), total, area)
+        share = valid.astype(np.float32)
+        row_area = rows.fold(share, None, 1, constant=True)
+        total = columns.fold(rows.fold(data, share, 1), row_area, 2)
+        return Share(
+            (rows.cells, columns.cells), total, columns.fold(row_area, None, 2, constant=True)
+        )
+
+    def take(self, share: Share) -> None:
+        """Add what a piece amounts to."""
+        if len(share.area) > len(self._area):
+            self._area = np.repeat(self._area, len(self._sum), axis=0)
+        self._area[:, *share.cells] += share.area
+        self._sum[:, *share.cells] += share.total
 
     def result(self) -> tuple[Float32Array, BoolArray]:
         """Averages (B, H, W) float32 and (B, H, W) bool, True where half the cell was valid."""
         valid = self._area >= 0.5 * self._ratio[0] * self._ratio[1] * (1 - 1e-6)
         data = np.zeros(self._sum.shape, dtype=np.float32)
         np.divide(self._sum, self._area, out=data, where=valid, casting="unsafe")
-        return data, valid
+        return data, np.broadcast_to(valid, data.shape).copy()
 
 
 class _Cells:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 CACHE_BYTES = 64_000_000
 """GDAL's own default is 5 % of the RAM; 64 MB loses nothing when pieces are read block by block."""
+
+PIECES_BYTES = 16_000_000
+"""What the threads of a decimated read decode at a time; their pieces share no block."""
+
+TILES_BYTES = 32_000_000
+"""What tiles side by side share, in strips of 40 000 pixels too."""
 
 
 class _SharedCacheLimit:
@@ -17,6 +25,8 @@ class _SharedCacheLimit:
         self._lock = threading.Lock()
         self._users = 0
         self._before = 0
+        self._lowered = 0
+        self._usual = 0
 
     def acquire(self) -> None:
         from rasterio.env import get_gdal_config, set_gdal_config
@@ -26,6 +36,25 @@ class _SharedCacheLimit:
                 self._before = int(get_gdal_config("GDAL_CACHEMAX"))
                 set_gdal_config("GDAL_CACHEMAX", min(self._before, CACHE_BYTES))
             self._users += 1
+
+    @contextmanager
+    def lowered(self, limit: int) -> Iterator[None]:
+        """A smaller cache for a while; nothing that was read meanwhile stays in it."""
+        from rasterio.env import get_gdal_config, set_gdal_config
+
+        with self._lock:
+            self._lowered += 1
+            if self._lowered == 1:
+                self._usual = int(get_gdal_config("GDAL_CACHEMAX"))
+                set_gdal_config("GDAL_CACHEMAX", min(self._usual, limit))
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._lowered -= 1
+                if self._lowered == 0:
+                    set_gdal_config("GDAL_CACHEMAX", 0)
+                    set_gdal_config("GDAL_CACHEMAX", self._usual)
 
     def release(self) -> None:
         from rasterio.env import set_gdal_config
@@ -47,6 +76,21 @@ def bounded_cache() -> Iterator[None]:
         yield
     finally:
         _cache_limit.release()
+
+
+@contextmanager
+def passing_through(cache_bytes: int) -> Iterator[None]:
+    """Read blocks that no one will ask for later on: they do not stay in GDAL's cache."""
+    with _cache_limit.lowered(cache_bytes):
+        yield
+    trim_heap()
+
+
+def trim_heap() -> None:
+    """Give freed memory back to the system: glibc keeps it, in pieces that large arrays miss."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 @contextmanager

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +18,11 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.decimate import BoxAverage
-from geodelreg.image.environment import gdal_calls
+from geodelreg.image.decimate import BoxAverage, Share
+from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
+from geodelreg.image.paths import is_local
 from geodelreg.image.quality import quality_bands
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.types import BoolArray, Float32Array, Grid, Window
@@ -26,8 +30,12 @@ from geodelreg.types import BoolArray, Float32Array, Grid, Window
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-_PIECE_PIXELS = 2_000_000
-"""Pixels (of all bands together) that a decimated read holds at a time."""
+_PIECE_PIXELS = 1_000_000
+"""Pixels (of all bands together) that a thread of a decimated read holds at a time."""
+
+_MOST_THREADS = 4
+_PIECES_PER_THREAD = 4
+"""Fewer are read sooner than more handles of the file are opened."""
 
 _LARGE_BLOCK_BYTES = 64_000_000
 
@@ -75,6 +83,7 @@ class RasterFile:
         known = {*self._alpha, *self.quality_bands}
         self.image_bands = tuple(number for number in every if number not in known)
         self._placements: dict[int, Placement] = {}
+        self._more_handles: list[DatasetReader] = []
 
     @cached_property
     def _masked_bands(self) -> frozenset[int]:
@@ -135,7 +144,8 @@ class RasterFile:
     ) -> tuple[Float32Array, BoolArray]:
         """Pixels of a window, averaged down to `shape` from an overview or from the full raster.
 
-        Only a piece is in memory at a time.  Parameters and returned values as in `read`.
+        Only a piece for each thread is in memory at a time; whatever their number, the same sums
+        are added in the same order.  Parameters and returned values as in `read`.
         """
         if overview is None:
             dataset, placement = self.dataset, Placement((1.0, 1.0))
@@ -143,9 +153,24 @@ class RasterFile:
             dataset, placement = self._overviews[overview], self._placement(overview)
         origin, size = placement.area(window)
         average = BoxAverage(len(numbers), shape, origin, size)
-        for piece in _pieces(dataset, origin, size, len(numbers)):
-            shown = self._shown(numbers, piece, dataset, placement)
-            average.add(*shown, piece.column, piece.row)
+        pieces = _pieces(dataset, origin, size, len(numbers))
+        levels = self._handles(len(pieces)) if overview is None else [dataset]
+
+        def share(piece: Window) -> Share:
+            level = free.get()
+            try:
+                pixels = self._shown(numbers, piece, level, placement)
+            finally:
+                free.put(level)
+            return average.share(*pixels, piece.column, piece.row)
+
+        free: SimpleQueue[DatasetReader] = SimpleQueue()
+        for level in levels:
+            free.put(level)
+        with passing_through(PIECES_BYTES), ThreadPoolExecutor(len(levels)) as pool:
+            for start in range(0, len(pieces), 2 * len(levels)):
+                for one in pool.map(share, pieces[start : start + 2 * len(levels)]):
+                    average.take(one)
         return average.result()
 
     def _shown(
@@ -166,6 +191,13 @@ class RasterFile:
             valid = np.ones(data.shape, dtype=np.bool_)
         valid[:, hidden] = False
         return data, valid
+
+    def _handles(self, pieces: int) -> list[DatasetReader]:
+        """Handles of the full raster, one for each thread that is worth starting."""
+        wanted = min(os.cpu_count() or 1, _MOST_THREADS, pieces // _PIECES_PER_THREAD)
+        while is_local(self.path) and len(self._more_handles) + 1 < wanted:
+            self._more_handles.append(self._stack.enter_context(open_dataset(self.path)))
+        return [self.dataset, *self._more_handles[: max(wanted - 1, 0)]]
 
     def _placement(self, overview: int) -> Placement:
         """Where an overview's pixels lie, found on first use."""
@@ -220,8 +252,8 @@ class RasterFile:
         return masks
 
     def _own_mask(self, number: int, window: Window, level: DatasetReader) -> NDArray[np.uint8]:
-        if level is self.dataset:
-            return np.asarray(self.dataset.read_masks(number, window=_slices(window)))
+        if level.shape == self.dataset.shape:
+            return np.asarray(level.read_masks(number, window=_slices(window)))
         # an overview without a mask of its own claims to be valid everywhere: ask the full raster
         down, across = self.dataset.height / level.height, self.dataset.width / level.width
         area = (

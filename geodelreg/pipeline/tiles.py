@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from geodelreg.geo.pixel import pixel_centres
+from geodelreg.image.environment import TILES_BYTES, passing_through
 from geodelreg.match.surface import SPLINE_REACH_PX, Surface, make_surface
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import Band, BoolArray, FloatArray, Grid, Window, WindowReader
@@ -206,6 +207,6 @@ def hide(band: Band, mask: BoolArray, mask_grid: Grid) -> Band:
 
 def read_tiles(part: Roles, windows: list[Window], matrix: FloatArray, threads: int) -> list[Tile]:
     """Read planned tiles, in order; those that lie outside the surface raster are left out."""
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with passing_through(TILES_BYTES), ThreadPoolExecutor(max(threads, 1)) as pool:
         tiles = pool.map(lambda window: read_tile(part, window, matrix), windows)
         return [tile for tile in tiles if tile is not None]
