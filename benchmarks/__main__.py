@@ -13,6 +13,7 @@ COMMANDS = {
     "gate": ("benchmarks.gate", "false accepts and false refusals of the gate"),
     "peers": ("benchmarks.runner", "geodelreg and its peers side by side"),
     "compare": ("benchmarks.peer_table", "two result files of `peers` as ratios"),
+    "scale": ("benchmarks.scale", "time and memory against the size of the rasters"),
     "filters": ("benchmarks.filters", "mismatch filters against known truth"),
 }
 

@@ -193,8 +193,8 @@ def _pan_origin(spec: SceneSpec, imagery: Imagery) -> tuple[int, int]:
     return round(column - spec.pan_shape[1] / 2), round(row - spec.pan_shape[0] / 2)
 
 
-def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Placement]:
-    """Header and true geotransform of MS, and where its pixels lie in PAN."""
+def true_grids(spec: SceneSpec, imagery: Imagery, pan: Affine) -> Truth:
+    """Header and true geotransform of MS, for a PAN raster at `pan`."""
     from pyproj import CRS, Transformer
 
     height, width = spec.ms_shape
@@ -214,7 +214,7 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
         @ Affine.translation(-width / 2, -height / 2)
     )
     true = fine @ error @ ~fine @ header
-    truth = Truth(
+    return Truth(
         name=spec.name,
         description=spec.description,
         source=imagery.source,
@@ -226,9 +226,18 @@ def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Place
         ms_shape=spec.ms_shape,
         pan_shape=spec.pan_shape,
     )
+
+
+def _place(spec: SceneSpec, imagery: Imagery, pan: Affine) -> tuple[Truth, Placement]:
+    """Header and true geotransform of MS, and where its pixels lie in PAN."""
+    from pyproj import CRS, Transformer
+
+    truth = true_grids(spec, imagery, pan)
+    true = Affine(*truth.ms_true)
     if not spec.ms_epsg:
         return truth, affine_placement(~pan @ true, spec.ms_shape)
-
+    height, width = spec.ms_shape
+    pan_crs, ms_crs = CRS.from_wkt(truth.pan_crs), CRS.from_wkt(truth.ms_crs)
     back = Transformer.from_crs(ms_crs, pan_crs, always_xy=True)
 
     def to_pan(column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,6 +22,9 @@ FloatArray = NDArray[np.float64]
 PSF_REACH_MS_PX = 4.0
 TAPER_PX = 32
 OVERSAMPLE_BELOW_RATIO = 2.5
+FULL_SCALE = 4095
+READ_NOISE = 1.5
+SHOT_NOISE = 0.008
 SPLINE_ORDER: Literal[5] = 5
 
 
@@ -143,7 +146,10 @@ def _inverse(
 
 
 def digitise(
-    radiance: FloatArray, rng: np.random.Generator, read_noise: float = 1.5, shot: float = 0.008
+    radiance: FloatArray,
+    rng: np.random.Generator,
+    read_noise: float = READ_NOISE,
+    shot: float = SHOT_NOISE,
 ) -> NDArray[np.uint16]:
     """12-bit counts with signal-dependent Gaussian noise; 0 is kept for no-data.
 

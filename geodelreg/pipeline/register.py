@@ -81,7 +81,8 @@ def register(
         run = solve if options.method == "delaunay" else solve_baseline
         solution = run(seen, hypothesis)
         if solution is not None:
-            solution = _finish(seen, solution, found)
+            read_s = hypothesis.pair.read_s
+            solution = _finish(seen, solution, {"read": read_s, "search": found - read_s})
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return seen, solution
@@ -104,8 +105,10 @@ def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
     """
     by_area: list[tuple[Pair, WorkingPair]] = []
     empty: NoDataError | None = None
+    read_s = 0.0
     for scope in scopes(pair):
-        seen, images = _with_content(pair, read_working_pair(pair, scope))
+        seen, images = _with_content(pair, read_working_pair(pair, scope, read_s))
+        read_s = images.read_s
         empty = _emptiness(images)
         if empty is not None:
             continue
@@ -167,11 +170,11 @@ def area_hypothesis(pair: Pair, images: WorkingPair) -> Hypothesis:
     return Hypothesis(matrix, float("nan"), {}, images)
 
 
-def _finish(pair: Pair, solution: Solution, found_s: float) -> Solution:
+def _finish(pair: Pair, solution: Solution, found_s: dict[str, float]) -> Solution:
     return replace(
         solution,
         warnings=solution.warnings + warnings_of(pair, solution),
-        timings_s={"search": found_s, **solution.timings_s},
+        timings_s={**found_s, **solution.timings_s},
     )
 
 

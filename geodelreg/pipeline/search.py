@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from time import perf_counter
 
 import numpy as np
 
@@ -83,11 +84,14 @@ class WorkingPair:
         MS bands asked for.
     reference : Band
     scope : Scope
+    read_s : float
+        Seconds that reading took, that of scopes before it included.
     """
 
     source: list[Band]
     reference: Band
     scope: Scope
+    read_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,8 +155,9 @@ def _working_gsd_m(pair: Pair, scope: Scope) -> float:
     )
 
 
-def read_working_pair(pair: Pair, scope: Scope) -> WorkingPair:
+def read_working_pair(pair: Pair, scope: Scope, read_s: float = 0.0) -> WorkingPair:
     """Read both images of a scope at the same ground sampling distance (METHOD trap 10)."""
+    start = perf_counter()
     gsd = _working_gsd_m(pair, scope)
     source = pair.source.read(
         pair.source_bands, scope.source, _shape(scope.source, pair.source_gsd_m, gsd)
@@ -162,7 +167,7 @@ def read_working_pair(pair: Pair, scope: Scope) -> WorkingPair:
         scope.reference,
         _shape(scope.reference, pair.reference_gsd_m, gsd),
     )
-    return WorkingPair(source, reference[0], scope)
+    return WorkingPair(source, reference[0], scope, read_s + perf_counter() - start)
 
 
 def _shape(window: Window, gsd_m: tuple[float, float], target_m: float) -> tuple[int, int]:
