@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import PurePath
@@ -72,6 +73,9 @@ class RasterMask:
     ) -> None:
         self.path = spec.path
         self._hide = spec.hide
+        self._lock = (
+            threading.Lock()
+        )  # the image is read by several threads, the mask has one handle
         try:
             self._dataset = stack.enter_context(open_dataset(spec.path))
         except GeodelregError as error:
@@ -133,7 +137,7 @@ class RasterMask:
             (window.column, window.column + window.width),
         )
         try:
-            with gdal_calls():
+            with self._lock, gdal_calls():
                 return np.asarray(self._dataset.read(self.band, window=area))
         except (RasterioError, OSError, MemoryError, ValueError) as error:
             reason = " ".join(str(error.__cause__ or error).split())
