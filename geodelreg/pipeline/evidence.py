@@ -35,6 +35,7 @@ _RIVAL_TOLERANCE = 0.2
 _RIVAL_SIGMA = 0.5
 _RIVAL_SCORE = 0.5
 _WIDEST = 2
+_OVERLAY_ROWS = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,9 +260,14 @@ def overlay(part: Roles, template: Band, surface: Surface, matrix: FloatArray) -
     """Resample a surface onto a (decimated) template window under a correction `matrix`."""
     height, width = template.data.shape
     to_full = ~part.template.grid.transform @ template.grid.transform
-    columns, rows = np.meshgrid(*(pixel_centres(np.arange(side)) for side in (width, height)))
-    x, y = to_full @ (columns, rows)
-    values, usable = sample(surface, part.to_surface(matrix, np.stack([x, y], axis=-1)))
+    values = np.empty((height, width), dtype=np.float32)
+    usable = np.empty((height, width), dtype=np.bool_)
+    for top in range(0, height, _OVERLAY_ROWS):  # positions need ten times the memory of values
+        some = slice(top, min(top + _OVERLAY_ROWS, height))
+        sides = (np.arange(width), np.arange(some.start, some.stop))
+        x, y = to_full @ tuple(np.meshgrid(*(pixel_centres(side) for side in sides)))
+        xy = np.stack([x, y], axis=-1)
+        values[some], usable[some] = sample(surface, part.to_surface(matrix, xy))
     return Overlay(template.data, values, template.valid, usable)
 
 
