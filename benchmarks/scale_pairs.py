@@ -219,8 +219,8 @@ def _ms_chunks(ground: EndlessGround, truth: Truth) -> Iterator[Job]:
     to_pan = ~Affine(*truth.pan) @ Affine(*truth.ms_true)
 
     def expose(rows: Span, columns: Span) -> NDArray[np.uint16]:
-        down, fine_rows = _axis(rows, to_pan.e, to_pan.f)
-        across, fine_columns = _axis(columns, to_pan.a, to_pan.c)
+        down, fine_rows = integration_axis(rows, to_pan.e, to_pan.f)
+        across, fine_columns = integration_axis(columns, to_pan.a, to_pan.c)
         rng = np.random.default_rng([1, rows[0], columns[0]])
         fields = ground.radiance(fine_rows, fine_columns)
         responses = zip(fields, BAND_GAMMAS, BAND_GAINS, strict=True)
@@ -250,7 +250,7 @@ def _exposed(
     return np.asarray(np.clip(np.rint(counts + noise), 1, full), dtype=np.uint16)
 
 
-def _axis(span: Span, width: float, offset: float) -> tuple[Any, Span]:
+def integration_axis(span: Span, width: float, offset: float) -> tuple[Any, Span]:
     """Integration matrix of MS pixels along one axis, and the PAN pixels that it takes."""
     centres = np.asarray((np.arange(*span) + 0.5) * width + offset, dtype=np.float64)
     start = floor(centres[0]) - _PSF_REACH_PX
