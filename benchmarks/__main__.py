@@ -15,6 +15,7 @@ COMMANDS = {
     "compare": ("benchmarks.peer_table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale", "time and memory against the size of the rasters"),
     "filters": ("benchmarks.filters", "mismatch filters against known truth"),
+    "fuzz": ("benchmarks.fuzz", "mutated inputs: no crash, hang or half-written file"),
 }
 
 
