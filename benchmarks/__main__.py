@@ -16,6 +16,7 @@ COMMANDS = {
     "scale": ("benchmarks.scale", "time and memory against the size of the rasters"),
     "filters": ("benchmarks.filters", "mismatch filters against known truth"),
     "fuzz": ("benchmarks.fuzz", "mutated inputs: no crash, hang or half-written file"),
+    "kills": ("benchmarks.kills", "kill -9 at random times: old or new files, nothing between"),
 }
 
 

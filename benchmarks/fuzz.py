@@ -29,6 +29,11 @@ from benchmarks.report import replace_section
 Row = dict[str, Any]
 
 HANG_S = 30.0
+"""Of CPU time, for the machine may be busy."""
+
+WAIT_S = 300.0
+"""Of wall time, for a case that waits for something."""
+
 LARGEST_RSS = 1_500_000_000
 _ADDRESS_SPACE = 12_000_000_000
 """Beyond this an allocation fails, before the machine suffers."""
@@ -78,6 +83,14 @@ def _rss(pid: int) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+def _cpu_s(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 @dataclass(slots=True)
 class Worker:
     """A process, the case it runs, and since when."""
@@ -87,6 +100,7 @@ class Worker:
     pipe: Connection
     number: int | None = None
     started: float = 0.0
+    cpu_before: float = 0.0
 
     @classmethod
     def start(cls, root: Path) -> Worker:
@@ -103,6 +117,7 @@ class Worker:
     def give(self, number: int) -> None:
         """Start a case."""
         self.number, self.started = number, time.monotonic()
+        self.cpu_before = _cpu_s(self.process.pid or 0)
         self.pipe.send(number)
 
     def poll(self) -> Row | None:
@@ -114,8 +129,9 @@ class Worker:
         except EOFError:
             self.process.join()
             return self._lost("crash", f"exit code {self.process.exitcode}: {self._last_words()}")
-        if time.monotonic() - self.started > HANG_S:
-            return self._lost("hang", f"more than {HANG_S:g} s")
+        waited = time.monotonic() - self.started
+        if waited > WAIT_S or _cpu_s(self.process.pid or 0) - self.cpu_before > HANG_S:
+            return self._lost("hang", f"stopped after {waited:.0f} s")
         if (rss := _rss(self.process.pid or 0)) > 2 * LARGEST_RSS:
             return self._lost("memory", f"{rss / 1e6:.0f} MB")
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import rasterio.shutil
 from affine import Affine
 from numpy.typing import NDArray
 from rasterio.control import GroundControlPoint
+from rasterio.errors import NotGeoreferencedWarning
 
 PAN_SIDE, RATIO = 80, 4
 UTM = "EPSG:32618"
@@ -80,7 +82,8 @@ def make_seeds(is_pan: bool, pan_side: int = PAN_SIDE) -> list[Seed]:
         Pixels of the reference.
     """
     seeds = []
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
         for layout, profile in LAYOUTS.items():
             folder = Path(name, layout)
             folder.mkdir()
@@ -105,7 +108,13 @@ def _collected(layout: str, path: Path) -> Seed:
 def _write(
     folder: Path, layout: str, profile: Mapping[str, Any], is_pan: bool, pan_side: int
 ) -> Path:
-    options = {"driver": "GTiff", "dtype": "uint16", "count": 4, "crs": UTM, "transform": TRUE}
+    options: dict[str, Any] = {
+        "driver": "GTiff",
+        "dtype": "uint16",
+        "count": 4,
+        "crs": UTM,
+        "transform": TRUE,
+    }
     options |= profile
     if is_pan:
         options["count"] = 3 if layout in ("jpeg", "webp") else 1

@@ -342,8 +342,8 @@ def vrt_size(data: bytes, rng: random.Random) -> bytes:
 
 TIFF_MUTATIONS: tuple[Mutation, ...] = (
     _values_of(SIZE_TAGS), _values_of(CODE_TAGS), _values_of(BLOCK_TAGS, 6),
-    _values_of(GEO_TAGS, 3), _values_of((KEYS_TAG,), 3), entry_field, entry_field, drop_entry, cycle, nodata, ascii_value,
-    pixel_bits, truncate, blind, blind,
+    _values_of(GEO_TAGS, 3), _values_of((KEYS_TAG,), 3), entry_field, entry_field,
+    drop_entry, cycle, nodata, ascii_value, pixel_bits, truncate, blind, blind,
 )  # fmt: skip
 XML_MUTATIONS: tuple[Mutation, ...] = (text_token, text_token, text_lines, blind, truncate)
 VRT_MUTATIONS: tuple[Mutation, ...] = (*XML_MUTATIONS, vrt_source, vrt_source, vrt_size)

@@ -26,9 +26,10 @@ class GeodelregError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, cause: str, remedy: str = "") -> None:
-        self.cause = cause
+        # names and texts of damaged files must not control the terminal
+        self.cause = "".join(char if char.isprintable() else "\ufffd" for char in cause)
         self.remedy = remedy
-        super().__init__(f"{cause}. {remedy}" if remedy else cause)
+        super().__init__(f"{self.cause}. {remedy}" if remedy else self.cause)
 
 
 class UsageError(GeodelregError, ValueError):
@@ -43,6 +44,10 @@ class RasterNotFoundError(GeodelregError):
 
 class RasterUnreadableError(GeodelregError):
     """The input is not a raster, is truncated, or one of its blocks cannot be decoded."""
+
+
+class AccessNotAllowedError(GeodelregError):
+    """A name, or a file behind it, reaches beyond what ``allow`` lets GDAL open."""
 
 
 class MissingGeoreferenceError(GeodelregError):

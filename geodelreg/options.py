@@ -16,6 +16,7 @@ METHODS = ("delaunay", "zhang2013", "sift")
 MODELS = ("auto", "shift", "scale", "similarity", "affine")
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
+ACCESS = ("local", "network", "all")
 RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
 
 
@@ -110,11 +111,19 @@ class AlignOptions:
         "Refuse a correction that scales by more than this factor (or by less than its inverse).",
     )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
+    allow: str = _knob(
+        "local",
+        "What names of rasters, and VRTs, may open. local: files of this machine, also in "
+        "archives; network: addresses and web services as well; all: whatever GDAL can, also "
+        "databases, Python code in VRTs and raw bytes of any file.",
+        ACCESS,
+    )
     seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
 
     def __post_init__(self) -> None:
         _check_choice(self, "method")
         _check_choice(self, "model")
+        _check_choice(self, "allow")
         _check_range(self, "band", 1, 65535)
         _check_range(self, "pan_band", 1, 65535)
         _check_masks(self, "masks")

@@ -139,7 +139,7 @@ def align_params() -> list[SectionOption]:
             help="Draw the tie points on both images (needs the report extra).",
         ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
-        *knob_options(AlignOptions, CORRECTION, without=["threads"]),
+        *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
         *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
         *run_options(),
     ]

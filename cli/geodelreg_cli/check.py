@@ -72,7 +72,7 @@ def check_params() -> list[SectionOption]:
             section=VERDICT,
             help="Print the report on stdout in place of the text; its block is .check.",
         ),
-        *knob_options(AlignOptions, MEASUREMENT, without=["threads", "tolerance_px"]),
+        *knob_options(AlignOptions, MEASUREMENT, without=["threads", "allow", "tolerance_px"]),
         *run_options(),
     ]
 

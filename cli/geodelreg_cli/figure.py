@@ -26,7 +26,10 @@ def bands_to_show(alignment: Alignment) -> tuple[Band, Band]:
     from geodelreg.image.reader import open_raster
 
     options, weights = alignment.options, alignment.band_weights
-    with open_raster(alignment.source_paths) as ms, open_raster(alignment.reference_path) as pan:
+    with (
+        open_raster(alignment.source_paths, options.allow) as ms,
+        open_raster(alignment.reference_path, options.allow) as pan,
+    ):
         heaviest = max(weights, key=lambda name: weights[name], default="")
         number = ms.band_names.index(heaviest) + 1 if heaviest in ms.band_names else 1
         return _overview(ms, options.band or number), _overview(pan, options.pan_band)

@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING
 
 import click
 
+from geodelreg.options import AlignOptions
 from geodelreg_cli.console import configure_logging
-from geodelreg_cli.options import GCP_FORMAT, SectionCommand
+from geodelreg_cli.options import (
+    GCP_FORMAT,
+    RUN,
+    SectionCommand,
+    add_options,
+    keep_to,
+    knob_option,
+)
 
 if TYPE_CHECKING:
     from geodelreg.types import Gcp, Grid
@@ -28,6 +36,7 @@ geojson (.geojson, .json), vrt (.vrt), envi (.pts, image to image), envi-map (im
 """
 
 
+@add_options([knob_option(AlignOptions, "allow", RUN)])
 @click.command(cls=SectionCommand, epilog=EPILOG)
 @click.argument("source", metavar="IN", type=click.Path(path_type=Path))
 @click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
@@ -57,6 +66,7 @@ def gcps(
     quiet: bool,
     verbose: int,
     debug: bool,
+    allow: str,
 ) -> None:
     """Convert the ground control points of file IN to file OUT.
 
@@ -64,11 +74,12 @@ def gcps(
     coordinates in another system than that of MS are transformed into it.
     """
     configure_logging(verbose, quiet, debug)
+    keep_to(allow)
     from geodelreg.image.reader import open_raster
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
 
     def grid(path: str) -> Grid:
-        with open_raster(path) as reader:
+        with open_raster(path, allow) as reader:
             return reader.grid
 
     context = GcpContext(

@@ -153,6 +153,7 @@ def run_options() -> list[SectionOption]:
     """Options that every long-running command has: resources, GDAL's settings, messages."""
     return [
         knob_option(AlignOptions, "threads", RUN),
+        knob_option(AlignOptions, "allow", RUN),
         SectionOption(
             ["--config"],
             nargs=2,
@@ -185,6 +186,15 @@ def start_run(given: Mapping[str, Any]) -> None:
             os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
         except ValueError as error:
             raise click.UsageError(f"--config {key} {value}: {error}") from error
+    keep_to(given["allow"])
+
+
+def keep_to(allow: str) -> None:
+    """Take what fetches out of GDAL, which is not loaded yet, unless the user allows it."""
+    from geodelreg.image.access import LOCAL, close_the_network
+
+    if allow == LOCAL:
+        close_the_network(os.environ)
 
 
 def ms_and_pan(rasters: tuple[str, ...]) -> tuple[tuple[str, ...], str]:

@@ -11,11 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.errors import CrsTransformError, GeodelregError, MaskError, MissingCrsError
+from geodelreg.errors import (
+    AccessNotAllowedError,
+    CrsTransformError,
+    GeodelregError,
+    MaskError,
+    MissingCrsError,
+)
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.geo.pixel import pixel_centres
+from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.quality import (
@@ -53,6 +60,8 @@ class RasterMask:
         Closes the file.
     band : int, optional
         Number of the mask's band; the only one when not given.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Attributes
     ----------
@@ -69,7 +78,12 @@ class RasterMask:
     """
 
     def __init__(
-        self, spec: MaskSpec, image: Grid, stack: ExitStack, band: int | None = None
+        self,
+        spec: MaskSpec,
+        image: Grid,
+        stack: ExitStack,
+        band: int | None = None,
+        allow: str = LOCAL,
     ) -> None:
         self.path = spec.path
         self._hide = spec.hide
@@ -77,7 +91,9 @@ class RasterMask:
             threading.Lock()
         )  # the image is read by several threads, the mask has one handle
         try:
-            self._dataset = stack.enter_context(open_dataset(spec.path))
+            self._dataset = stack.enter_context(open_dataset(spec.path, allow=allow))
+        except AccessNotAllowedError:
+            raise
         except GeodelregError as error:
             raise MaskError(f"the mask {error.cause}", _remedy(spec.path, error)) from error
         self.band = band or _only_band(spec.path, self._dataset)

@@ -8,6 +8,7 @@ from pathlib import PurePath
 
 import numpy as np
 
+from geodelreg.image.access import LOCAL, check_name
 from geodelreg.image.mask_raster import RasterMask
 from geodelreg.image.mask_vector import VectorMask, is_vector
 from geodelreg.masking import MaskSpec, MaskUse, Ranges, parse_mask
@@ -30,6 +31,8 @@ class Masks:
         Path, number and kind of the quality bands that are part of the image.
     stack : ExitStack
         Closes the files.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Raises
     ------
@@ -46,17 +49,19 @@ class Masks:
         names: Sequence[str],
         bands: Sequence[tuple[str, int, str]],
         stack: ExitStack,
+        allow: str = LOCAL,
     ) -> None:
         self._image_name = image_name
         self._masks: list[RasterMask | VectorMask] = []
         self._hide: list[Ranges] = []
         for path, number, kind in bands:
-            self._masks.append(RasterMask(MaskSpec(path, kind), image, stack, number))
+            self._masks.append(RasterMask(MaskSpec(path, kind), image, stack, number, allow))
             self._hide.append(())
         for spec in map(parse_mask, names):
+            check_name(spec.path, allow)
             vector = is_vector(spec.path)
             self._masks.append(
-                VectorMask(spec, image) if vector else RasterMask(spec, image, stack)
+                VectorMask(spec, image) if vector else RasterMask(spec, image, stack, allow=allow)
             )
             self._hide.append(spec.hide)
         self._hidden = np.zeros(len(self._masks) + 1, dtype=np.int64)

@@ -6,7 +6,7 @@ import logging
 import math
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from affine import Affine
 
@@ -17,9 +17,10 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
 )
+from geodelreg.image.access import LOCAL, check_name, drivers
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.paths import is_local
-from geodelreg.image.vrt_sources import check_vrt_sources
+from geodelreg.image.vrt_sources import check_regular, check_vrt_sources, is_vrt
 from geodelreg.types import Grid
 
 if TYPE_CHECKING:
@@ -27,38 +28,62 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_COMMON_SIDE = 1_000_000
+_COMMON_PIXELS = 100_000_000
 # the equator in pixels of 0.4 m
 _LARGEST_SIDE = 100_000_000
 # the densest lossless codecs of TIFF do not reach this
 _PIXELS_PER_BYTE = 20_000
 
 
-def open_dataset(path: str, overview_level: int | None = None) -> DatasetReader:
+def open_dataset(path: str, overview_level: int | None = None, allow: str = LOCAL) -> DatasetReader:
     """Open a raster file with GDAL and check that it holds real pixels.
+
+    Parameters
+    ----------
+    path : str
+    overview_level : int, optional
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Raises
     ------
-    RasterNotFoundError, RasterUnreadableError
+    RasterNotFoundError, RasterUnreadableError, AccessNotAllowedError
     """
-    import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.io import DatasetReader
 
-    if is_local(path) and not Path(path).exists():
-        raise RasterNotFoundError(f"{path} does not exist", "Check the path.")
-    options = {} if overview_level is None else {"overview_level": overview_level}
+    stored_bytes = _check_before_opening(path, allow)
+    options: dict[str, Any] = {} if overview_level is None else {"overview_level": overview_level}
     try:
         with gdal_calls(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = rasterio.open(path, **options)
-    except (RasterioError, OSError, ValueError) as error:
+            if allow == LOCAL:
+                options["driver"] = list(drivers(with_vrt=stored_bytes is not None))
+            dataset = DatasetReader(path, **options)
+    except (RasterioError, OSError, ValueError, SystemError) as error:
         raise _unreadable(path, error) from error
     try:
         _check_pixels(path, dataset)
+        _check_size(path, dataset, stored_bytes)
+        with gdal_calls():
+            overviews = dataset.tags(ns="OVERVIEWS").get("OVERVIEW_FILE", "")
+        check_name(overviews, allow, f", named in {path},")
     except BaseException:
         dataset.close()
         raise
     return dataset
+
+
+def _check_before_opening(path: str, allow: str) -> int | None:
+    """Bytes on the disk behind a local name; None behind any other."""
+    check_name(path, allow)
+    if not is_local(path):
+        return None
+    file = Path(path)
+    if not file.exists():
+        raise RasterNotFoundError(f"{path} does not exist", "Check the path.")
+    check_regular(file)
+    return check_vrt_sources(file, allow) if is_vrt(file) else file.stat().st_size
 
 
 def _unreadable(path: str, error: Exception) -> RasterUnreadableError | RasterNotFoundError:
@@ -95,17 +120,14 @@ def _check_pixels(path: str, dataset: DatasetReader) -> None:
                 f"band {number} of {path} holds complex numbers",
                 "Write its amplitude to a new file first, for example with gdal_calc.py.",
             )
-    _check_size(path, dataset)
-    if dataset.driver == "VRT":
-        check_vrt_sources(path)
 
 
-def _check_size(path: str, dataset: DatasetReader) -> None:
-    """Refuse sizes that are certainly wrong, before anything is allocated for them."""
+def _check_size(path: str, dataset: DatasetReader, stored_bytes: int | None) -> None:
+    """Refuse sizes that are certainly wrong, before anything is allocated or read for them."""
     side, pixels = max(dataset.width, dataset.height), dataset.width * dataset.height
     absurd = side > _LARGEST_SIDE
-    if side > _COMMON_SIDE and dataset.driver == "GTiff" and is_local(path):
-        absurd |= pixels > _PIXELS_PER_BYTE * Path(path).stat().st_size
+    if pixels > _COMMON_PIXELS and dataset.driver in ("GTiff", "VRT") and stored_bytes is not None:
+        absurd |= pixels > _PIXELS_PER_BYTE * stored_bytes
     if absurd:
         raise RasterUnreadableError(
             f"the header of {path} claims {dataset.width} × {dataset.height} pixels, more than "

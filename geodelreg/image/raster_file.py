@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
+from geodelreg.image.access import LOCAL
 from geodelreg.image.decimate import BoxAverage, Share
 from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
 from geodelreg.image.opening import dataset_grid, open_dataset
@@ -51,6 +52,8 @@ class RasterFile:
     path : str
     stack : ExitStack
         Closes the file, and its overviews when they were needed.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Attributes
     ----------
@@ -69,9 +72,9 @@ class RasterFile:
     UnsupportedGeoreferenceError, MissingCrsError
     """
 
-    def __init__(self, path: str, stack: ExitStack) -> None:
-        self.path = path
-        self.dataset = stack.enter_context(open_dataset(path))
+    def __init__(self, path: str, stack: ExitStack, allow: str = LOCAL) -> None:
+        self.path, self._allow = path, allow
+        self.dataset = stack.enter_context(open_dataset(path, allow=allow))
         self.grid = dataset_grid(path, self.dataset)
         self._stack = stack
         every = range(1, self.dataset.count + 1)
@@ -94,7 +97,8 @@ class RasterFile:
         with gdal_calls():
             count = min(len(self.dataset.overviews(n)) for n in range(1, self.dataset.count + 1))
         return tuple(
-            self._stack.enter_context(open_dataset(self.path, index)) for index in range(count)
+            self._stack.enter_context(open_dataset(self.path, index, self._allow))
+            for index in range(count)
         )
 
     @property
@@ -196,7 +200,8 @@ class RasterFile:
         """Handles of the full raster, one for each thread that is worth starting."""
         wanted = min(os.cpu_count() or 1, _MOST_THREADS, pieces // _PIECES_PER_THREAD)
         while is_local(self.path) and len(self._more_handles) + 1 < wanted:
-            self._more_handles.append(self._stack.enter_context(open_dataset(self.path)))
+            handle = open_dataset(self.path, allow=self._allow)
+            self._more_handles.append(self._stack.enter_context(handle))
         return [self.dataset, *self._more_handles[: max(wanted - 1, 0)]]
 
     def _placement(self, overview: int) -> Placement:
@@ -223,7 +228,7 @@ class RasterFile:
             with gdal_calls():
                 raw = level.read(list(numbers), window=_slices(window))
                 masks = self._masks(numbers, window, level)
-        except (RasterioError, OSError, MemoryError, ValueError) as error:
+        except (RasterioError, OSError, MemoryError, ValueError, SystemError) as error:
             reason = " ".join(str(error.__cause__ or error).split())
             raise RasterUnreadableError(
                 f"{self.path}: the pixels of columns {window.column} to "

@@ -21,6 +21,7 @@ from geodelreg.errors import (
     UsageError,
 )
 from geodelreg.geo.grid import decimated_grid
+from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import bounded_cache, gdal_calls
 from geodelreg.image.raster_file import RasterFile
 from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window
@@ -59,16 +60,18 @@ class RasterReader:
         What hides pixels beyond what the files themselves say; None when nothing does.
     """
 
-    def __init__(self, paths: Sequence[str], masks: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, paths: Sequence[str], masks: Sequence[str] | None = None, allow: str = LOCAL
+    ) -> None:
         if not paths:
             raise UsageError("no raster file was named", "Give at least one.")
         self._lock = threading.Lock()
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
-            files = [RasterFile(path, stack) for path in paths]
+            files = [RasterFile(path, stack, allow) for path in paths]
             self._files = _on_the_common_grid(_with_image_bands(files))
             self.paths = tuple(file.path for file in self._files)
-            self.masks = self._open_masks(files, masks, stack)
+            self.masks = self._open_masks(files, masks, stack, allow)
             self._stack = stack.pop_all()
         self.other_paths = tuple(file.path for file in files if file not in self._files)
         self._bands = _list_bands(self._files)
@@ -173,7 +176,7 @@ class RasterReader:
         return [Band(*planes[band], grid, band.name) for band in wanted]
 
     def _open_masks(
-        self, files: list[RasterFile], names: Sequence[str] | None, stack: ExitStack
+        self, files: list[RasterFile], names: Sequence[str] | None, stack: ExitStack, allow: str
     ) -> Masks | None:
         """The masks named, and the quality bands of the files."""
         bands = [
@@ -186,7 +189,7 @@ class RasterReader:
             return None
         from geodelreg.image.masks import Masks
 
-        masks = Masks(self.grid, self.name, names, bands, stack)
+        masks = Masks(self.grid, self.name, names, bands, stack, allow)
         for file in self._files:
             file.hides = masks.hides
         return masks
@@ -289,7 +292,9 @@ def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
 
 
 def open_raster(
-    path: str | PathLike[str] | Sequence[str | PathLike[str]], masks: Sequence[str] | None = None
+    path: str | PathLike[str] | Sequence[str | PathLike[str]],
+    masks: Sequence[str] | None = None,
+    allow: str = LOCAL,
 ) -> RasterReader:
     """Open an image for reading: one file, or one file per band.
 
@@ -303,6 +308,8 @@ def open_raster(
     masks : sequence of str, optional
         Masks of the image, ``FILE`` or ``FILE=HIDE``.  Bands and files that are called QA_PIXEL or
         SCL are masks of the others without being named.  None: nothing is masked.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Returns
     -------
@@ -319,9 +326,11 @@ def open_raster(
         If the files' CRSs differ.
     MaskError, MissingExtraError
         If a mask cannot be used.
+    AccessNotAllowedError
+        If a name, or what a VRT names, needs more than `allow`.
     """
     paths = [path] if isinstance(path, str) or hasattr(path, "__fspath__") else list(path)
-    return RasterReader([str(one) for one in paths], masks)
+    return RasterReader([str(one) for one in paths], masks, allow)
 
 
 def check_band(reader: RasterReader, number: int) -> None:

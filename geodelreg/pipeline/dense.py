@@ -312,6 +312,10 @@ def _rigid_residuals(
 
 
 def _concatenate(parts: list[Refined]) -> Refined:
+    if not parts:
+        nothing = np.empty((0, 2))
+        status = np.empty(0, dtype=np.uint8)
+        return Refined(nothing, nothing, np.empty((0, 2, 2)), np.empty(0), status)
     return Refined(
         np.concatenate([p.template_px for p in parts]),
         np.concatenate([p.surface_px for p in parts]),

@@ -109,7 +109,7 @@ def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
     for scope in scopes(pair):
         seen, images = _with_content(pair, read_working_pair(pair, scope, read_s))
         read_s = images.read_s
-        empty = _emptiness(images)
+        empty = _emptiness(pair, images)
         if empty is not None:
             continue
         if not by_area:
@@ -138,13 +138,14 @@ def _has_content(band: Band) -> bool:
     return bool(values.size and values.min() < values.max())
 
 
-def _emptiness(images: WorkingPair) -> NoDataError | None:
+def _emptiness(pair: Pair, images: WorkingPair) -> NoDataError | None:
     for band in (images.source[0], images.reference):
         if not _has_content(band):
             values = band.data[band.valid]
             what = f"the constant value {values[0]:g}" if values.size else "no valid pixel"
+            reader = pair.reference if band is images.reference else pair.source
             return NoDataError(
-                f"{band.name} has {what} where the rasters overlap",
+                f"{reader.name}: {band.name} has {what} where the rasters overlap",
                 "Choose another band, or check the no-data value and the mask.",
             )
     return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.errors import CrsTransformError, UnsupportedGeoreferenceError
 from geodelreg.fit.models import Frame
 from geodelreg.geo.affine import affine_from_matrix, apply_affine
 from geodelreg.geo.crs import HeaderMapping, header_mapping, linearise
@@ -16,6 +17,9 @@ from geodelreg.types import FloatArray, WindowReader
 
 MOST_BANDS = 12
 """Bands of a hyperspectral image that are matched on at most."""
+
+_LARGEST_RATIO = 1e4
+"""Of the largest pixel size of the two rasters to the smallest."""
 
 Progress = Callable[[float, str], None]
 
@@ -127,13 +131,28 @@ def make_pair(source: WindowReader, reference: WindowReader, options: AlignOptio
     ------
     CrsTransformError
         If PROJ knows no operation between the CRSs.
+    UnsupportedGeoreferenceError
+        If the pixels of the two cannot be compared.
     """
-    return Pair(
-        source,
-        reference,
-        bands_asked(source, options),
-        header_mapping(source.grid, reference.grid),
-        gsd_px_m(source.grid),
-        gsd_px_m(reference.grid),
-        options,
+    try:
+        sizes = gsd_px_m(source.grid), gsd_px_m(reference.grid)
+        mapping = header_mapping(source.grid, reference.grid)
+    except CrsTransformError as error:
+        raise CrsTransformError(
+            f"{source.name} and {reference.name}: {error.cause}", error.remedy
+        ) from error
+    _check_sizes(source, reference, np.array(sizes))
+    return Pair(source, reference, bands_asked(source, options), mapping, *sizes, options)
+
+
+def _check_sizes(source: WindowReader, reference: WindowReader, gsd_m: FloatArray) -> None:
+    """Refuse headers whose pixels are absurd: filters and grids grow with the ratio of sizes."""
+    known = np.isfinite(gsd_m).all() and gsd_m.min() > 0
+    if known and gsd_m.max() <= _LARGEST_RATIO * gsd_m.min():
+        return
+    texts = [f"{across:.4g} × {down:.4g} m" for across, down in gsd_m.tolist()]
+    raise UnsupportedGeoreferenceError(
+        f"by their headers, pixels of {source.name} measure {texts[0]} and those of "
+        f"{reference.name} {texts[1]}, which cannot be compared",
+        "Correct the geotransform that is wrong: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
     )

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from geodelreg.errors import RasterUnreadableError
 
 CACHE_BYTES = 64_000_000
 """GDAL's own default is 5 % of the RAM; writing block by block needs no more than this."""
 
 
 @contextmanager
-def gdal_session() -> Iterator[None]:
-    """Bound GDAL's block cache, use all cores, keep masks inside TIFFs and write no statistics."""
+def gdal_session(source: Path) -> Iterator[None]:
+    """Bound GDAL's block cache, use all cores, keep masks inside TIFFs and write no statistics.
+
+    Raises
+    ------
+    RasterUnreadableError
+        GDAL failed where nobody expected it: properties of a damaged `source` fail when asked for.
+    """
     import rasterio
     from rasterio.env import get_gdal_config
 
@@ -23,12 +32,17 @@ def gdal_session() -> Iterator[None]:
         GDAL_TIFF_INTERNAL_MASK=True,
         GTIFF_IMPLICIT_JPEG_OVR=False,
     ):
-        yield
+        try:
+            yield
+        except gdal_failures() as error:
+            raise RasterUnreadableError(
+                f"{source} cannot be read by GDAL: {error}", "Obtain the file again, or repair it."
+            ) from error
 
 
 def gdal_failures() -> tuple[type[Exception], ...]:
-    """Exceptions that rasterio raises for GDAL's errors."""
+    """Exceptions that rasterio raises for GDAL's errors; the last when GDAL gives no reason."""
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import RasterioError
 
-    return (RasterioError, CPLE_BaseError)
+    return (RasterioError, CPLE_BaseError, SystemError)

@@ -69,7 +69,7 @@ def write_corrected(
         raise UsageError("There are no ground control points to write", "Use the geotransform.")
     content = Provenance(correction, gcps, tags, options.georef, options.strip_rpc)
     check_not_input(target, [source])
-    with gdal_session():
+    with gdal_session(source):
         check_source(source)
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), source)
         with staged(target, overwrite=options.overwrite, stale=stale) as out:

@@ -69,7 +69,7 @@ def edit_in_place(
     """
     content = Provenance(correction, gcps, tags)
     raster = Path(os.path.realpath(path))
-    with gdal_session(), _opened(path, raster) as file:
+    with gdal_session(path), _opened(path, raster) as file:
         edits = _recovered(raster, file)
         check_source(raster)
         notes = []

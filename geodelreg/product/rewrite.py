@@ -185,8 +185,9 @@ def _inherited_compression(
     creation = {"COMPRESS": compression}
     predictor = structure.get("PREDICTOR", "1")
     if predictor != "1":
+        # a damaged file may name any: COG then chooses none
         names = {"2": "STANDARD", "3": "FLOATING_POINT"}
-        creation["PREDICTOR"] = predictor if driver == "GTiff" else names[predictor]
+        creation["PREDICTOR"] = predictor if driver == "GTiff" else names.get(predictor, "NO")
     return creation
 
 

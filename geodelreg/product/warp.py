@@ -98,7 +98,7 @@ def write_warped(
     """
     check_not_input(target, [source])
     content = Provenance(correction, (), tags)
-    with gdal_session():
+    with gdal_session(source):
         check_source(source)
         driver = output_driver(target, options.driver)
         grid = _target_grid(source, correction, reference, options)

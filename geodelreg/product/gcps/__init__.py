@@ -143,7 +143,10 @@ def write_gcps(
     chosen = _format(format or _format_by_extension(target))
     for gcp in gcps:
         if not all(map(math.isfinite, (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z))):
-            raise GcpFormatError(f"{target}: point {gcp.id} has a coordinate that is not finite")
+            raise GcpFormatError(
+                f"{target}: point {gcp.id} has a coordinate that is not finite",
+                "Leave the point out.",
+            )
     write_text_atomically(target, chosen.encode(gcps, context, target), overwrite)
 
 
@@ -178,13 +181,16 @@ def read_gcps(
     try:
         text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise GcpFormatError(f"{source} cannot be read ({error})") from error
+        raise GcpFormatError(
+            f"{source} cannot be read ({error})", "Check the path; the text must be UTF-8."
+        ) from error
     if format is None and name == "envi" and envi.is_image_to_map(text):
         name = "envi-map"
     try:
         return _format(name).decode(text, context)
     except GcpFormatError as error:
-        raise GcpFormatError(f"{source}: {error.cause}", error.remedy) from error
+        remedy = error.remedy or f"Correct the file, or name its format; {name} was read."
+        raise GcpFormatError(f"{source}: {error.cause}", remedy) from error
 
 
 def _format(name: str) -> GcpFormat:

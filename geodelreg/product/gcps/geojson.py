@@ -75,10 +75,10 @@ def _features(text: str) -> list[Any]:
     try:
         try:
             document = json.loads(text)
-        except json.JSONDecodeError:
+        except ValueError:
             lines = text.replace(_RECORD_SEPARATOR, "").splitlines()
             return [json.loads(line) for line in lines if line.strip()]
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also of numbers with thousands of digits
         raise GcpFormatError(f"it is not GeoJSON ({error})") from error
     if isinstance(document, dict) and document.get("type") == "FeatureCollection":
         features = document.get("features")
