@@ -7,7 +7,7 @@ touched, so that it also tells the next run what a killed one was doing.
 from __future__ import annotations
 
 import base64
-import binascii
+import hashlib
 import json
 import os
 import zlib
@@ -21,7 +21,9 @@ from geodelreg.errors import UnsafeInPlaceError
 from geodelreg.product import sidecars
 from geodelreg.product.atomic import fsync_folder, staged, write_fully, write_text_atomically
 
-_VERSION = 1
+_VERSION = 2
+_LARGEST_BYTES = 1 << 28
+"""Of a record, and of each of its parts; a damaged one may unpack to anything."""
 
 
 class State(Enum):
@@ -118,13 +120,25 @@ def load(raster: Path) -> list[Edit]:
     """
     path = record_path(raster)
     try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ValueError("too large")
         document = json.loads(path.read_bytes())
         if document["version"] != _VERSION:
             raise ValueError(f"version {document['version']}")
-        return [_decoded(raster, item) for item in document["edits"]]
+        edits = [_decoded(raster, item) for item in document["edits"]]
+        if document["sha256"] != _digest(document["edits"]):
+            raise ValueError("its checksum is wrong")
+        return edits
     except FileNotFoundError:
         return []
-    except (ValueError, KeyError, TypeError, zlib.error, binascii.Error) as error:
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        RecursionError,
+        zlib.error,
+    ) as error:
         raise UnsafeInPlaceError(
             f"{path} is no undo record that this version understands ({error})",
             f"If {raster.name} is as it should be, remove the record and try again.",
@@ -141,11 +155,16 @@ def save(raster: Path, edits: Sequence[Edit]) -> None:
     """
     path = record_path(raster)
     if edits:
-        document = {"version": _VERSION, "edits": [_encoded(edit) for edit in edits]}
+        encoded = [_encoded(edit) for edit in edits]
+        document = {"version": _VERSION, "sha256": _digest(encoded), "edits": encoded}
         write_text_atomically(path, json.dumps(document, indent=1) + "\n", overwrite=True)
     elif path.exists():
         path.unlink()
         fsync_folder(path.parent)
+
+
+def _digest(edits: Any) -> str:
+    return hashlib.sha256(json.dumps(edits, sort_keys=True).encode()).hexdigest()
 
 
 def _encoded(edit: Edit) -> dict[str, Any]:
@@ -174,7 +193,10 @@ def _decoded(raster: Path, item: dict[str, Any]) -> Edit:
             raise ValueError(f"{change['name']} does not belong to the raster")
         before, after = _bytes(change["before"]), _bytes(change["after"])
         changes.append(SidecarChange(change["name"], before, after))
-    return Edit(size, pointer_at, old, new, _bytes(item["tail"]) or b"", tuple(changes))
+    tail = _bytes(item["tail"])
+    if not tail:
+        raise ValueError("nothing was appended")
+    return Edit(size, pointer_at, old, new, tail, tuple(changes))
 
 
 def _text(data: bytes | None) -> str | None:
@@ -182,7 +204,13 @@ def _text(data: bytes | None) -> str | None:
 
 
 def _bytes(text: str | None) -> bytes | None:
-    return None if text is None else zlib.decompress(base64.b64decode(text, validate=True))
+    if text is None:
+        return None
+    unpacking = zlib.decompressobj()
+    data = unpacking.decompress(base64.b64decode(text, validate=True), _LARGEST_BYTES)
+    if not unpacking.eof:
+        raise ValueError("a part of it is cut off or too large")
+    return data
 
 
 def _read(file: BinaryIO, offset: int, length: int) -> bytes:

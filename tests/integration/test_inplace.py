@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import fcntl
 import json
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -261,6 +263,30 @@ def test_damaged_record_is_refused(tmp_path: Path, damage: str) -> None:
     for work in (revert, edit):
         with pytest.raises(UnsafeInPlaceError, match=r"geodelreg-undo\.json"):
             work(raster)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("size", 8),
+        ("size", float("inf")),
+        ("tail", base64.b64encode(zlib.compress(b"")).decode()),
+        ("tail", base64.b64encode(zlib.compress(bytes(1 << 29))).decode()),
+        ("old_pointer", "00000000"),
+    ],
+    ids=["short", "infinite", "nothing appended", "bomb", "pointer"],
+)
+def test_altered_record_never_reaches_the_raster(tmp_path: Path, key: str, value: object) -> None:
+    raster = make_tiff(tmp_path / "ms.tif")
+    edit(raster)
+    record = tmp_path / f"ms.tif{UNDO}"
+    document = json.loads(record.read_text())
+    document["edits"][0][key] = value
+    record.write_text(json.dumps(document))
+    before = contents(tmp_path)
+    with pytest.raises(UnsafeInPlaceError, match=r"geodelreg-undo\.json"):
+        revert(raster)
     assert contents(tmp_path) == before
 
 
