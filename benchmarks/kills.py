@@ -105,7 +105,7 @@ def _digest(path: Path) -> str:
 def _fresh(folder: Path) -> None:
     folder.mkdir()
     for name, is_pan in (("ms.tif", False), ("pan.tif", True)):
-        seeds = make_seeds(is_pan, PAN_SIDE)
+        seeds = make_seeds(is_pan, PAN_SIDE)  # of which one is used
         seed = next(seed for seed in seeds if seed.name == "tiled-deflate")
         (folder / name).write_bytes(seed.files["ms.tif"])
 
@@ -126,7 +126,8 @@ def run_scenario(scenario: Scenario, count: int, rng: random.Random, root: Path)
         folder = root / "killed"
         shutil.copytree(old, folder)
         delay = rng.uniform(_EARLY, 1.05) * duration
-        _kill_once(folder, scenario, delay, (before, after), tally)
+        # a busy machine makes the first run a poor guess
+        duration = _kill_once(folder, scenario, delay, (before, after), tally) or duration
         shutil.rmtree(folder)
     return tally
 
@@ -137,7 +138,9 @@ def _kill_once(
     delay: float,
     states: tuple[dict[str, str], dict[str, str]],
     tally: Tally,
-) -> None:
+) -> float | None:
+    """Kill one run; seconds that it took when it was faster."""
+    started = time.monotonic()
     with subprocess.Popen(
         [*COMMAND, *scenario.args],
         cwd=folder,
@@ -145,14 +148,14 @@ def _kill_once(
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     ) as process:
-        time.sleep(delay)
-        if process.poll() is None:
+        try:
+            process.wait(delay)
+        except subprocess.TimeoutExpired:
             os.kill(process.pid, signal.SIGKILL)
-        process.wait()
     before, after = states
     if process.returncode != -signal.SIGKILL:
         tally.outcomes["ended before"] += 1
-        return
+        return time.monotonic() - started
     tally.kills += 1
     kinds = {_kind(folder, name, before, after) for name in scenario.outputs}
     unchanged = all(
@@ -166,6 +169,7 @@ def _kill_once(
     if torn:
         tally.torn.append(f"{scenario.name} after {delay:.3f} s: {sorted(torn)}")
     _check_next_run(folder, scenario, after, tally)
+    return None
 
 
 def _kind(folder: Path, name: str, before: dict[str, str], after: dict[str, str]) -> str:
