@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from threading import Lock
 
 import numpy as np
 
@@ -41,15 +42,17 @@ class Tile:
     template: list[Band]
     surface: list[Band]
     _memo: dict[tuple[float, float, float], Surface] = field(default_factory=dict, repr=False)
+    _lock: Lock = field(default_factory=Lock, repr=False)
 
     def low_passed(self, full: Grid, sigma_px: tuple[float, float], high_pass_px: float) -> Surface:
         """`make_surface` of the first surface band; the last few are remembered."""
         key = (*sigma_px, high_pass_px)
-        if key not in self._memo:
-            while len(self._memo) >= _MEMO:
-                del self._memo[next(iter(self._memo))]
-            self._memo[key] = make_surface(self.surface[0], full, sigma_px, high_pass_px)
-        return self._memo[key]
+        with self._lock:  # several threads may match different bands of one tile
+            if key not in self._memo:
+                while len(self._memo) >= _MEMO:
+                    del self._memo[next(iter(self._memo))]
+                self._memo[key] = make_surface(self.surface[0], full, sigma_px, high_pass_px)
+            return self._memo[key]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
