@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
+from hypothesis import settings
 from numpy.typing import NDArray
+
+settings.register_profile("no deadline")  # a busy machine is no defect
+settings.load_profile("no deadline")
 
 UTM16 = "EPSG:32616"
 TRANSFORM = Affine(30.0, 0.0, 500_000.0, 0.0, -30.0, 1_400_000.0)

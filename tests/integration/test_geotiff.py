@@ -210,9 +210,7 @@ def test_metadata_in_latin_1_survives(tmp_path: Path) -> None:
 FINITE = {"allow_nan": False, "allow_infinity": False}
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     pixel=st.floats(1e-6, 1e4, **FINITE),
     aspect=st.floats(-3, 3, **FINITE).filter(lambda v: abs(v) > 0.2),

@@ -35,7 +35,7 @@ def spread_points(frame: Frame, count: int, rng: np.random.Generator) -> Array:
     return rng.uniform(low, 2 * np.array(frame.centre), (count, 2))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31), st.floats(1e-6, 0.3))
 def test_models_are_recovered_from_exact_points(
     frame: Frame, model: str, seed: int, size: float
@@ -53,7 +53,7 @@ def test_models_are_recovered_from_exact_points(
     assert found.extra_variance_px2 == 0.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(frames(), st.integers(0, 2**31), st.floats(0, 0.3))
 def test_a_similarity_is_one_on_the_ground(frame: Frame, seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
@@ -64,7 +64,7 @@ def test_a_similarity_is_one_on_the_ground(frame: Frame, seed: int, size: float)
     assert np.linalg.det(ground) > 0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31), st.floats(0, 0.3))
 def test_the_inverse_takes_it_back(frame: Frame, model: str, seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
@@ -74,7 +74,7 @@ def test_the_inverse_takes_it_back(frame: Frame, model: str, seed: int, size: fl
     assert there.inverse.model == model
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(frames(), st.integers(0, 2**31), st.floats(0, 0.3))
 def test_north_up_models_keep_the_axes(frame: Frame, seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
@@ -84,7 +84,7 @@ def test_north_up_models_keep_the_axes(frame: Frame, seed: int, size: float) -> 
     assert transformation("shift", parameters("shift", rng, size), frame).matrix[0, 0] == 1.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31))
 def test_too_few_points_are_refused_and_just_enough_fitted(
     frame: Frame, model: str, seed: int

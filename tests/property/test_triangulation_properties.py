@@ -35,7 +35,7 @@ def hull_area(xy: np.ndarray) -> float:
 
 
 @given(lattice_points)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_triangles_tile_the_hull_and_use_every_place(xy: np.ndarray) -> None:
     """Lattice points: duplicates, collinear and cocircular points abound."""
     triangles = delaunay(xy)
@@ -48,7 +48,7 @@ def test_triangles_tile_the_hull_and_use_every_place(xy: np.ndarray) -> None:
 
 
 @given(lattice_points)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_no_point_lies_inside_a_circumcircle(xy: np.ndarray) -> None:
     for i, j, k in delaunay(xy).tolist():
         a, b, c = (xy[n] for n in (i, j, k))
@@ -63,7 +63,7 @@ def test_no_point_lies_inside_a_circumcircle(xy: np.ndarray) -> None:
 
 
 @given(seeds)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_agrees_with_qhull_on_points_in_general_position(seed: int) -> None:
     xy = random_points(seed)
     expected = {frozenset(t) for t in Delaunay(xy).simplices.tolist()}
@@ -71,7 +71,7 @@ def test_agrees_with_qhull_on_points_in_general_position(seed: int) -> None:
 
 
 @given(seeds, st.floats(1e-3, 1e5), st.floats(0, 7), st.floats(-1e6, 1e6))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_measures_do_not_depend_on_scale_rotation_or_place(
     seed: int, scale: float, turn: float, place: float
 ) -> None:
@@ -91,7 +91,7 @@ def test_measures_do_not_depend_on_scale_rotation_or_place(
 
 
 @given(lattice_points)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_counts_obey_euler_and_neighbours_mirror_edges(xy: np.ndarray) -> None:
     triangles = delaunay(xy)
     if len(triangles) == 0:
@@ -108,7 +108,7 @@ def test_counts_obey_euler_and_neighbours_mirror_edges(xy: np.ndarray) -> None:
 
 
 @given(seeds)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_same_points_give_the_same_bytes(seed: int) -> None:
     xy = random_points(seed)
     assert delaunay(xy).tobytes() == delaunay(xy.copy()).tobytes()

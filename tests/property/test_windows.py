@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from affine import Affine
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS
 
@@ -120,7 +120,6 @@ def test_averages_ignore_what_is_not_valid(
     np.testing.assert_allclose(values[known], 7, rtol=1e-4)
 
 
-@settings(deadline=None)
 @given(grids(), grids(), st.sampled_from([0.0, 17.0]))
 def test_overlap_windows_cover_all_shared_points(
     source: Grid, reference: Grid, grow_px: float

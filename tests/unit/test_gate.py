@@ -97,7 +97,7 @@ def test_nothing_found_is_a_refusal() -> None:
     assert not refused.accepted
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.integers(1, 3000), st.floats(0, 1), st.floats(0.02, 0.9))
 def test_binomial_tail_is_scipys(trials: int, share: float, probability: float) -> None:
     """An upper bound, and a tight one where it counts."""

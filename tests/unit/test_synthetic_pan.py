@@ -39,7 +39,7 @@ def noisy(values: Array, sigma: float, seed: int = 9) -> NDArray[np.float32]:
     return (values + noise).astype(np.float32)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.floats(-3, 3))
 def test_weights_are_scipys(seed: int, count: int, tilt: float) -> None:
     rng = np.random.default_rng(seed)
