@@ -10,6 +10,8 @@ COMMANDS = {
     "scenes": ("benchmarks.scenes", "write the scenes with known truth"),
     "sweep": ("benchmarks.sweep", "align many scenes: rotation, shift, scale, GSD ratio"),
     "real": ("benchmarks.real_pairs", "align real pairs and measure them independently"),
+    "paper": ("benchmarks.paper", "the paper's experiments: SIFT, its method, ours, by ablation"),
+    "bound": ("benchmarks.bound", "errors against the Cramér–Rao bound"),
     "gate": ("benchmarks.gate", "false accepts and false refusals of the gate"),
     "peers": ("benchmarks.runner", "geodelreg and its peers side by side"),
     "compare": ("benchmarks.peer_table", "two result files of `peers` as ratios"),

@@ -174,17 +174,30 @@ def make_scene(spec: SceneSpec, imagery: Imagery) -> Scene:
     rng = np.random.default_rng(zlib.crc32(spec.name.encode()))
     if spec.variant == "large":
         imagery = ground_module.enlarge(imagery, max(spec.pan_shape), rng)
-    origin = _pan_origin(spec, imagery)
-    pan_transform = imagery.transform @ Affine.translation(*origin)
-    truth, placement = _place(spec, imagery, pan_transform)
-    margin = _margin(placement, spec.pan_shape)
-    ground = cut_ground(imagery, origin, spec.pan_shape, margin)
+    truth, ground, placement = lay_out(spec, imagery)
     pan_ground, ms_ground, nodata = _variants(spec, ground, rng)
     pan = _expose_pan(pan_ground, spec.pan_weights, rng)
-    ms = _expose_ms(ms_ground, placement, margin, rng)
+    ms = _expose_ms(ms_ground, placement, rng)
     if nodata is not None:
         _cut_wedges(ms, pan)
     return Scene(ms, pan, truth, nodata)
+
+
+def lay_out(spec: SceneSpec, imagery: Imagery) -> tuple[Truth, Ground, Placement]:
+    """The truth of a scene, its ground without clouds or seasons, and where MS lies in it.
+
+    Returns
+    -------
+    truth : Truth
+    ground : Ground
+    placement : Placement
+        In the pixels of `ground`, not of PAN.
+    """
+    origin = _pan_origin(spec, imagery)
+    truth, placement = _place(spec, imagery, imagery.transform @ Affine.translation(*origin))
+    margin = _margin(placement, spec.pan_shape)
+    ground = cut_ground(imagery, origin, spec.pan_shape, margin)
+    return truth, ground, replace(placement, centres_px=placement.centres_px + margin)
 
 
 def _pan_origin(spec: SceneSpec, imagery: Imagery) -> tuple[int, int]:
@@ -286,11 +299,10 @@ def _expose_pan(
 
 
 def _expose_ms(
-    ground: Ground, placement: Placement, margin: int, rng: np.random.Generator
+    ground: Ground, placement: Placement, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    moved = replace(placement, centres_px=placement.centres_px + margin)
     bands = [
-        digitise(tone(render(band, moved, BLUR_MS_PX), gamma, gain), rng)
+        digitise(tone(render(band, placement, BLUR_MS_PX), gamma, gain), rng)
         for band, gamma, gain in zip(ground.bands, BAND_GAMMAS, BAND_GAINS, strict=True)
     ]
     return np.stack(bands)

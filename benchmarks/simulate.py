@@ -26,6 +26,8 @@ FULL_SCALE = 4095
 READ_NOISE = 1.5
 SHOT_NOISE = 0.008
 SPLINE_ORDER: Literal[5] = 5
+READ_NOISE = 1.5
+SHOT_NOISE = 0.008
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +147,13 @@ def _inverse(
     return np.asarray(fft.irfft2(dense, s=(factor * height, factor * width), workers=2))
 
 
+def noise_variance(
+    radiance: FloatArray, read_noise: float = READ_NOISE, shot: float = SHOT_NOISE
+) -> FloatArray:
+    """Variance of the noise at a radiance, both in counts."""
+    return np.asarray(read_noise**2 + shot * np.maximum(radiance, 0))
+
+
 def digitise(
     radiance: FloatArray,
     rng: np.random.Generator,
@@ -161,7 +170,7 @@ def digitise(
     read_noise, shot : float
         Noise variance is ``read_noise² + shot · counts``.
     """
-    sigma = np.sqrt(read_noise**2 + shot * np.maximum(radiance, 0))
+    sigma = np.sqrt(noise_variance(radiance, read_noise, shot))
     noisy = radiance + sigma * rng.standard_normal(radiance.shape)
     return np.clip(np.rint(noisy), 1, 4095).astype(np.uint16)
 

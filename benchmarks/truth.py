@@ -86,6 +86,12 @@ def _to_pan_px(transform: Affine, xy: FloatArray, truth: Truth) -> FloatArray:
     return np.stack(apply(~Affine(*truth.pan), x, y), axis=1)
 
 
+def pan_errors(corrected: Affine, truth: Truth) -> FloatArray:
+    """(441, 2) float64: found minus true PAN position of the check points, in PAN pixels."""
+    xy = check_points(truth.ms_shape)
+    return _to_pan_px(corrected, xy, truth) - _to_pan_px(Affine(*truth.ms_true), xy, truth)
+
+
 def grid_rmse(corrected: Affine, truth: Truth) -> dict[str, float]:
     """Radial error of a corrected geotransform over 21 × 21 check points of the MS raster.
 
@@ -100,8 +106,7 @@ def grid_rmse(corrected: Affine, truth: Truth) -> dict[str, float]:
     dict
         ``rmse_px``, ``p95_px``, ``max_px``, in PAN pixels.
     """
-    xy = check_points(truth.ms_shape)
-    error = _to_pan_px(corrected, xy, truth) - _to_pan_px(Affine(*truth.ms_true), xy, truth)
+    error = pan_errors(corrected, truth)
     radial = np.hypot(error[:, 0], error[:, 1])
     return {
         "rmse_px": float(np.sqrt(np.mean(radial**2))),
