@@ -14,7 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from geodelreg.match.zhang2013 import initial_status, reject_unshared
 from geodelreg.types import BoolArray, FloatArray, IntArray, Status
 
 SIZE_PX = 1000.0
+PRECISION, RECALL = 0.99, 0.97
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 Filter = Callable[[FloatArray, FloatArray, FloatArray], BoolArray]
 
@@ -225,6 +226,73 @@ def markdown(rows: Iterable[Row]) -> str:
     return "\n".join(lines)
 
 
+def reach(rows: list[Row]) -> str:
+    """Largest share of wrong matches up to which each filter meets the target, by kind of case."""
+    kinds: dict[Case, dict[str, list[Row]]] = {}
+    for row in rows:
+        kind = replace(row.case, outlier_share=0.0)
+        kinds.setdefault(kind, {}).setdefault(row.filter, []).append(row)
+    header = ["points", "distortion px", "noise px", "near misses", *FILTERS]
+    lines = [_line(header), _line(["--:"] * len(header))]
+    for kind, found in kinds.items():
+        key = [str(kind.count), f"{kind.distortion_px:g}", f"{kind.noise_px:g}"]
+        lines.append(
+            _line([*key, f"{100 * kind.near_share:.0f} %", *(_reach(found[f]) for f in FILTERS)])
+        )
+    return "\n".join(lines)
+
+
+def _reach(rows: list[Row]) -> str:
+    """The share before the first at which the target is missed."""
+    best = "–"
+    for row in sorted(rows, key=lambda row: row.case.outlier_share):
+        if row.precision < PRECISION or row.recall < RECALL:
+            break
+        best = f"{100 * row.case.outlier_share:.0f} %"
+    return best
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Precision and recall over the share of wrong matches, of the noisiest cases.
+
+    Parameters
+    ----------
+    rows : list of Row
+        Those of the fewest points and near misses are drawn, one column for each distortion.
+    path : Path
+    """
+    from matplotlib.figure import Figure
+
+    few, noise = min(r.case.count for r in rows), max(r.case.noise_px for r in rows)
+    near = min(r.case.near_share for r in rows)
+    shown = (few, noise, near)
+    drawn = [r for r in rows if (r.case.count, r.case.noise_px, r.case.near_share) == shown]
+    bends = sorted({r.case.distortion_px for r in drawn})
+    figure = Figure(figsize=(9.5, 6.4), layout="constrained")
+    grid = figure.subplots(2, len(bends), squeeze=False, sharex=True, sharey=True)
+    for column, bend in enumerate(bends):
+        for line, (measure, target) in enumerate((("precision", PRECISION), ("recall", RECALL))):
+            axes = grid[line, column]
+            for name, marker in zip(FILTERS, "*os^vDP", strict=True):
+                part = [r for r in drawn if r.filter == name and r.case.distortion_px == bend]
+                axes.plot(
+                    [100 * r.case.outlier_share for r in part],
+                    [getattr(r, measure) for r in part],
+                    marker=marker, ms=5, lw=2.0 if name == "geodelreg" else 1.0, label=name,
+                )  # fmt: skip
+            axes.axhline(target, color="0.5", lw=0.8, ls=":")
+            axes.set(ylim=(-0.02, 1.03))
+            axes.grid(alpha=0.3)
+            grid[line, 0].set_ylabel(measure)
+        grid[0, column].set_title(
+            f"smooth distortion {bend:g} px, noise {noise:g} px, {few} points"
+        )
+        grid[1, column].set_xlabel("wrong matches, %")
+    grid[1, 0].legend(fontsize=8, loc="lower left")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
 def _line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
@@ -240,6 +308,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--share", type=float, nargs="+", default=SHARES, help="wrong ones")
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--json", type=Path, help="write all figures to this file")
+    parser.add_argument("--docs", type=Path, help="page whose section is replaced, with its plot")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -253,7 +322,14 @@ def run(arguments: argparse.Namespace) -> int:
         for share in arguments.share
         for row in measure(Case(count, distortion, noise, share, near), arguments.repetitions)
     ]
-    print(markdown(rows))
+    text = f"{reach(rows)}\n\n{markdown(rows)}"
+    print(text)
+    if arguments.docs:
+        from benchmarks.report import machine, replace_section
+
+        draw(rows, arguments.docs.parent / "images" / "filters.png")
+        note = f"Mean of {arguments.repetitions} drawings, median ms. {machine()}."
+        replace_section(arguments.docs, "filters", f"{text}\n\n{note}")
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     return 0
