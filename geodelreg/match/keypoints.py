@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +18,10 @@ logger = logging.getLogger(__name__)
 OCTAVE_LAYERS = 3
 DESCRIPTOR_LENGTH = 128
 ROOT_DESCRIPTOR_NORM = 512.0
+_WHOLE_PX = 600_000
+_TILE_PX = 640
+_MARGIN_PX = 128
+_OCTAVES_PX = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +83,75 @@ def detect(
         contrastThreshold=min(options.contrast, options.low_contrast),
         enable_precise_upscale=True,
     )
-    found = sift.detect(image, None)
-    if not found:
+    tiles = _tiles(image.shape)
+    found = [_detect_in_tile(sift, image, tile) for tile in tiles]
+    table = np.concatenate(
+        [_table(points) + tile.offset for tile, points in zip(tiles, found, strict=True)]
+    )
+    if not len(table):
         return no_keypoints()
-    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], dtype=np.float64)
     candidates = np.flatnonzero(_away_from_invalid(table, valid, options.invalid_margin))
     chosen = candidates[_spread_order(table[candidates], image.shape, options)]
-    logger.debug("%d keypoints found, %d kept", len(found), len(chosen))
-    return _describe(sift, image, [found[i] for i in chosen], options.root)
+    logger.debug("%d keypoints found, %d kept", len(table), len(chosen))
+    return _describe(sift, image, list(zip(tiles, found, strict=True)), chosen, options.root)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    """Rows and columns of the image that belong to a tile, and those it is looked at with."""
+
+    core: tuple[slice, slice]
+    around: tuple[slice, slice]
+
+    @property
+    def offset(self) -> FloatArray:
+        """(5,) what takes a row of `_table` from pixels of `around` to those of the image."""
+        return np.array([self.around[1].start, self.around[0].start, 0, 0, 0], dtype=np.float64)
+
+
+def _tiles(shape: tuple[int, ...]) -> list[_Tile]:
+    """Parts of a large image: SIFT's scale space takes some 230 bytes a pixel."""
+    if shape[0] * shape[1] <= _WHOLE_PX:
+        whole = (slice(0, shape[0]), slice(0, shape[1]))
+        return [_Tile(whole, whole)]
+    rows, columns = (_spans(side) for side in shape)
+    return [
+        _Tile((row, column), (around_row, around_column))
+        for row, around_row in rows
+        for column, around_column in columns
+    ]
+
+
+def _spans(side: int) -> list[tuple[slice, slice]]:
+    """Cores that start where all octaves have a pixel, and the same with margins."""
+    count = max(round(side / _TILE_PX), 1)
+    step = -(-side // (count * _OCTAVES_PX)) * _OCTAVES_PX
+    return [
+        (
+            slice(start, min(start + step, side)),
+            slice(max(start - _MARGIN_PX, 0), min(start + step + _MARGIN_PX, side)),
+        )
+        for start in range(0, side, step)
+    ]
+
+
+def _detect_in_tile(sift: cv2.SIFT, image: NDArray[np.uint8], tile: _Tile) -> list[cv2.KeyPoint]:
+    """Keypoints of a tile's core, in pixels of what it is looked at with."""
+    found = list(sift.detect(np.ascontiguousarray(image[tile.around]), None))
+    left, top = tile.offset[:2]
+    rows, columns = tile.core
+
+    def is_mine(point: cv2.KeyPoint) -> bool:
+        x, y = point.pt[0] + left, point.pt[1] + top
+        return bool(columns.start <= x < columns.stop and rows.start <= y < rows.stop)
+
+    return found if tile.core == tile.around else [point for point in found if is_mine(point)]
+
+
+def _table(found: Sequence[cv2.KeyPoint]) -> FloatArray:
+    """(N, 5) position (pixel centres), size, angle and response."""
+    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], dtype=np.float64)
+    return table.reshape(-1, 5)
 
 
 def no_keypoints() -> Keypoints:
@@ -128,13 +194,26 @@ def _spread_order(table: FloatArray, shape: tuple[int, int], options: KeypointOp
 
 
 def _describe(
-    sift: cv2.SIFT, image: NDArray[np.uint8], found: list[cv2.KeyPoint], root: bool
+    sift: cv2.SIFT,
+    image: NDArray[np.uint8],
+    found: Sequence[tuple[_Tile, list[cv2.KeyPoint]]],
+    chosen: IntArray,
+    root: bool,
 ) -> Keypoints:
-    if not found:
+    """Describe the chosen ones, numbered through all tiles, in their order."""
+    if not len(chosen):
         return no_keypoints()
-    described, computed = sift.compute(image, found)
-    descriptors = np.asarray(computed, dtype=np.float32)
-    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in described], dtype=np.float64)
+    table = np.empty((len(chosen), 5))
+    descriptors = np.empty((len(chosen), DESCRIPTOR_LENGTH), dtype=np.float32)
+    first = 0
+    for tile, points in found:
+        mine = np.flatnonzero((chosen >= first) & (chosen < first + len(points)))
+        if len(mine):
+            kept = [points[number - first] for number in chosen[mine]]
+            part = np.ascontiguousarray(image[tile.around])
+            described, descriptors[mine] = sift.compute(part, kept)
+            table[mine] = _table(described) + tile.offset
+        first += len(points)
     return Keypoints(
         centre_to_corner(np.ascontiguousarray(table[:, :2])),
         table[:, 2].copy(),

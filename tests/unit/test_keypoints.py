@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from geodelreg.match.keypoints import KeypointOptions, detect
 from geodelreg.types import Keypoints
@@ -138,3 +139,22 @@ def test_featureless_image_gives_none(shape: tuple[int, int]) -> None:
     assert len(found) == 0
     assert found.descriptors.shape == (0, 128)
     assert found.xy.shape == (0, 2)
+
+
+def test_large_images_are_looked_at_in_parts_and_lose_nothing() -> None:
+    image = texture(900, 1150, seed=8)
+    parts = detect(image, everywhere(image), KeypointOptions(max_keypoints=4000))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("geodelreg.match.keypoints._WHOLE_PX", image.size)
+        whole = detect(image, everywhere(image), KeypointOptions(max_keypoints=4000))
+    assert len(parts) == len(whole) == 4000
+
+    def spots(found: Keypoints) -> NDArray[np.float64]:
+        turn = np.radians(found.angle_deg)  # one place may have several orientations
+        return np.column_stack([found.xy, np.cos(turn), np.sin(turn)])
+
+    near, which = KDTree(spots(whole)).query(spots(parts))
+    same = near < 0.02
+    assert same.mean() > 0.98
+    apart = np.abs(whole.descriptors[which][same] - parts.descriptors[same])
+    assert np.median(apart.max(axis=1)) == 0
