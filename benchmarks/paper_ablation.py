@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import process_time
 from typing import TypeVar
 
@@ -68,9 +69,9 @@ def ablate(stage: Stage, matched: Matched) -> dict[str, Ablated]:
     findable = distinct_right(matched, start)
     found = {}
     for name, steps in compositions().items():
-        (status, _), cpu_ms = _timed(lambda steps=steps: run_steps(matched, steps))
+        (status, _), cpu_ms = _timed(partial(run_steps, matched, steps))
         found[name] = _ablated(stage, matched, status == Status.KEPT, findable, cpu_ms)
-    (kept, _), cpu_ms = _timed(lambda: run_mesh(matched))
+    (kept, _), cpu_ms = _timed(partial(run_mesh, matched))
     found[MESH] = _ablated(stage, matched, kept, findable, cpu_ms)
     return found
 
@@ -117,15 +118,16 @@ def interval(
     known = [(g, v) for g, v in zip(groups, values, strict=True) if np.isfinite(v)]
     if not known:
         return np.nan, np.nan, np.nan
-    by_group = [
-        np.array([v for g, v in known if g == name]) for name in sorted({g for g, _ in known})
-    ]
+    names = sorted({group for group, _ in known})
+    members = [[value for group, value in known if group == name] for name in names]
+    most = max(map(len, members))
+    padded = np.array([[*v, *[np.nan] * (most - len(v))] for v in members], dtype=np.float64)
+    counts = np.array([len(values) for values in members])
     rng = np.random.default_rng(seed)
-    medians = np.empty(draws)
-    for k in range(draws):
-        chosen = rng.integers(len(by_group), size=len(by_group))
-        medians[k] = np.median(
-            np.concatenate([rng.choice(by_group[i], len(by_group[i])) for i in chosen])
-        )
+    chosen = rng.integers(len(names), size=(draws, len(names)))
+    index = (rng.random((draws, len(names), most)) * counts[chosen][:, :, None]).astype(np.intp)
+    drawn = padded[chosen[:, :, None], index]
+    drawn[np.arange(most) >= counts[chosen][:, :, None]] = np.nan
+    medians = np.nanmedian(drawn.reshape(draws, -1), axis=1)
     low, high = np.percentile(medians, (2.5, 97.5))
     return float(np.median([v for _, v in known])), float(low), float(high)

@@ -319,13 +319,12 @@ def score_ours(stage: Stage) -> Score:
         lost = (math.nan, math.nan, math.nan, process_time() - start)
         return Score({}, 0, 0, 0, 0, *lost, outcome=type(error).__name__)
     cpu_s = process_time() - start
-    points, matrix = solution.tie_points, solution.transformation.matrix
-    error = _error_px(stage, points.source_px[points.kept], points.reference_px[points.kept])
-    if not points.kept.any():
-        matrix = None
+    points = solution.tie_points
+    off_px = _error_px(stage, points.source_px[points.kept], points.reference_px[points.kept])
+    matrix = solution.transformation.matrix if points.kept.any() else None
     rmse = true_rmse(stage, matrix)
     return Score(
-        solution.step_counts, *_counts(error), solution.accuracy.fit_rmse_px, rmse,
+        solution.step_counts, *_counts(off_px), solution.accuracy.fit_rmse_px, rmse,
         grey_error(stage, matrix), cpu_s, solution.verdict.outcome.value,
         rmse if solution.verdict.accepted else math.nan,
     )  # fmt: skip
