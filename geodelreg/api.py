@@ -57,8 +57,8 @@ def _open(
     source: AnyPath | Sequence[AnyPath], reference: AnyPath, options: AlignOptions
 ) -> Iterator[_Rasters]:
     with (
-        open_raster(source, options.masks, options.allow) as ms,
-        open_raster(reference, options.pan_masks, options.allow) as pan,
+        open_raster(source, options.masks, allow=options.allow) as ms,
+        open_raster(reference, options.pan_masks, allow=options.allow) as pan,
     ):
         yield _Rasters(ms, pan, _paths(source), str(reference))
 
@@ -383,7 +383,7 @@ def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, .
     gcps, shared = gcps_from_alignment(alignment), alignment.correction
     if len(alignment.source_paths) == 1:
         return shared, gcps
-    with open_raster(path, alignment.options.allow) as reader:
+    with open_raster(path, allow=alignment.options.allow) as reader:
         own = reader.grid.transform
     if own == shared.original:
         return shared, gcps

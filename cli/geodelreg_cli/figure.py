@@ -27,8 +27,8 @@ def bands_to_show(alignment: Alignment) -> tuple[Band, Band]:
 
     options, weights = alignment.options, alignment.band_weights
     with (
-        open_raster(alignment.source_paths, options.allow) as ms,
-        open_raster(alignment.reference_path, options.allow) as pan,
+        open_raster(alignment.source_paths, allow=options.allow) as ms,
+        open_raster(alignment.reference_path, allow=options.allow) as pan,
     ):
         heaviest = max(weights, key=lambda name: weights[name], default="")
         number = ms.band_names.index(heaviest) + 1 if heaviest in ms.band_names else 1

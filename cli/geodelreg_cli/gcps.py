@@ -79,7 +79,7 @@ def gcps(
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
 
     def grid(path: str) -> Grid:
-        with open_raster(path, allow) as reader:
+        with open_raster(path, allow=allow) as reader:
             return reader.grid
 
     context = GcpContext(

@@ -23,6 +23,7 @@ MAX_RIVAL = 0.85
 MAX_RIVAL_MOTION = 0.67
 MIN_SUPPORT = 0.5
 MAX_BANDS_APART = 0.5
+MAX_KEYPOINTS_APART = 2.0
 SYSTEMATIC_PX = 0.005
 SIGNIFICANCE = 3.0
 
@@ -135,6 +136,18 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     if options.max_scale is not None:
         reasons.append(_at_most("max_scale", evidence.scale, options.max_scale, "scale factor"))
     return tuple(reasons)
+
+
+def keypoints_apart(distance: float) -> Reason:
+    """The reason that keypoints give: where they put the ground before, with more certainty.
+
+    Parameters
+    ----------
+    distance : float
+        Between the correction and what stronger, refused keypoint matches say, coarser pixels.
+    """
+    what = "coarser px from where keypoints, with more certainty, put the ground"
+    return _at_most("keypoints_apart", distance, MAX_KEYPOINTS_APART, what)
 
 
 def nothing_agrees() -> Reason:

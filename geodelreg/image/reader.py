@@ -61,7 +61,7 @@ class RasterReader:
     """
 
     def __init__(
-        self, paths: Sequence[str], masks: Sequence[str] | None = None, allow: str = LOCAL
+        self, paths: Sequence[str], masks: Sequence[str] | None = None, *, allow: str = LOCAL
     ) -> None:
         if not paths:
             raise UsageError("no raster file was named", "Give at least one.")
@@ -294,6 +294,7 @@ def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
 def open_raster(
     path: str | PathLike[str] | Sequence[str | PathLike[str]],
     masks: Sequence[str] | None = None,
+    *,
     allow: str = LOCAL,
 ) -> RasterReader:
     """Open an image for reading: one file, or one file per band.
@@ -330,7 +331,7 @@ def open_raster(
         If a name, or what a VRT names, needs more than `allow`.
     """
     paths = [path] if isinstance(path, str) or hasattr(path, "__fspath__") else list(path)
-    return RasterReader([str(one) for one in paths], masks, allow)
+    return RasterReader([str(one) for one in paths], masks, allow=allow)
 
 
 def check_band(reader: RasterReader, number: int) -> None:

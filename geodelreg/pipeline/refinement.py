@@ -69,6 +69,8 @@ class Refinement:
         MS pixels to MS header pixels.
     size : int
         Side of a patch, template pixels.
+    dark_only : bool
+        The tiles show no bright objects.
     without_bright : bool
         Bright objects were left out, because with them the patches agree on something else.
     """
@@ -78,6 +80,7 @@ class Refinement:
     dense: Dense
     matrix: FloatArray
     size: int
+    dark_only: bool = False
     without_bright: bool = False
 
 
@@ -95,14 +98,21 @@ def refine_densely(
     region = overlap_in_template(part, matrix)
     if region is None:
         return None
-    threads, size = thread_count(part.pair), patch_size(region)
+    threads, size = thread_count(part.pair), patch_size(region.width * region.height)
     tiles = read_tiles(part, plan_tiles(region, part.surface_px_per_template_px), matrix, threads)
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
-    options = RefineOptions(size=size)
+    options = RefineOptions(size=min(size, patch_size(_visible_px(tiles))))
     refined = _of_the_ground(part, tiles, hypothesis, matrix, options) if tiles else None
     timings["refine"] = perf_counter() - start
     return refined
+
+
+def _visible_px(tiles: list[Tile]) -> float:
+    """Template pixels that both images show, about."""
+    return sum(
+        float(tile.template[0].valid.sum()) * float(tile.surface[0].valid.mean()) for tile in tiles
+    )
 
 
 def _of_the_ground(
@@ -119,10 +129,11 @@ def _of_the_ground(
     everything = _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
     if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
         return everything
-    hidden = [_without_bright(part, tile, hypothesis) for tile in tiles]
-    ground = _passes(part, hidden, matrix, options, (_HAZE, _PLAIN), _near_header(part, matrix))
-    if ground is not None and _kept(ground) < _TELLING_PATCHES:
-        ground = None
+    hidden = [dark_tile(part, tile, hypothesis) for tile in tiles]
+    small = replace(options, size=min(options.size, patch_size(_visible_px(hidden))))
+    ground = _passes(part, hidden, matrix, small, (_HAZE, _PLAIN), _near_header(part, matrix))
+    if ground is not None:
+        ground = replace(ground, dark_only=True) if _kept(ground) >= _TELLING_PATCHES else None
     if ground is not None and not _agree(part, ground, everything):
         everything = _passes(part, tiles, ground.matrix, options, (_PLAIN, *_SHARPER))
     if ground is None or everything is None:
@@ -284,7 +295,7 @@ def _coarse_refinement(part: Roles, hypothesis: Hypothesis) -> FloatArray:
         return hypothesis.matrix
     tile = working_tile(part, images)
     if hypothesis.bright is not None:
-        tile = _without_bright(part, tile, hypothesis)
+        tile = dark_tile(part, tile, hypothesis)
     tone = fit_tone(part, [tile], hypothesis.matrix, COARSE_SIGMA, 1)
     tuning = Tuning(COARSE_SIGMA, tone)
     dense = match_pass(part, [tile], hypothesis.matrix, tuning, RefineOptions(), 1)
@@ -298,7 +309,8 @@ def working_tile(part: Roles, images: WorkingPair) -> Tile:
     return Tile([images.reference], images.source)
 
 
-def _without_bright(part: Roles, tile: Tile, hypothesis: Hypothesis) -> Tile:
+def dark_tile(part: Roles, tile: Tile, hypothesis: Hypothesis) -> Tile:
+    """The tile without the bright objects of a hypothesis that has some."""
     assert hypothesis.bright is not None
     source = hypothesis.bright[0], hypothesis.pair.source[0].grid
     reference = hypothesis.bright[1], hypothesis.pair.reference.grid

@@ -10,6 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from geodelreg.errors import NoDataError, NoOverlapError
+from geodelreg.fit.gate import keypoints_apart, verdict
 from geodelreg.fit.models import IDENTITY
 from geodelreg.geo.affine import affine_from_matrix
 from geodelreg.match.area import best_shift
@@ -19,6 +20,7 @@ from geodelreg.pipeline.advice import warnings_of
 from geodelreg.pipeline.baseline import solve_baseline
 from geodelreg.pipeline.evidence import overlay
 from geodelreg.pipeline.search import (
+    SURE_LOG_NFA,
     WHOLE,
     Hypothesis,
     WorkingPair,
@@ -30,7 +32,7 @@ from geodelreg.pipeline.search import (
 from geodelreg.pipeline.solve import Solution, solve, unsolved
 from geodelreg.pipeline.state import Pair, Progress, make_pair
 from geodelreg.pipeline.tiles import roles
-from geodelreg.types import Band, Correction, WindowReader
+from geodelreg.types import Band, Correction, Outcome, WindowReader
 
 logger = logging.getLogger(__name__)
 
@@ -73,6 +75,7 @@ def register(
     pair = make_pair(source, reference, options)
     start = perf_counter()
     refused: Solution | None = None
+    heard: list[Hypothesis] = []
     looked = 0.0
     report(0.02, "reading")
     for seen, hypothesis in hypotheses(pair):
@@ -83,10 +86,12 @@ def register(
         if solution is not None:
             read_s = hypothesis.pair.read_s
             solution = _finish(seen, solution, {"read": read_s, "search": found - read_s})
+            solution = heeding(seen, solution, hypothesis, heard)
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return seen, solution
             refused = _better(refused, solution)
+        heard.append(hypothesis)
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
     if refused is None:
@@ -177,6 +182,27 @@ def _finish(pair: Pair, solution: Solution, found_s: dict[str, float]) -> Soluti
         warnings=solution.warnings + warnings_of(pair, solution),
         timings_s={**found_s, **solution.timings_s},
     )
+
+
+def heeding(
+    pair: Pair, solution: Solution, hypothesis: Hypothesis, heard: list[Hypothesis]
+) -> Solution:
+    """The solution, judged also by keypoints that agree with more certainty than its own.
+
+    They were refused, where too little is in sight or clouds are about; that makes a place which
+    fewer keypoints, or none, speak for no better.
+    """
+    points = solution.tie_points.source_px[solution.tie_points.kept]
+    here = pair.to_reference(solution.transformation.matrix, points)
+    unit = max(pair.pan_px_per_source_px, 1.0)
+    apart = [
+        float(np.median(np.hypot(*(here - pair.to_reference(other.matrix, points)).T))) / unit
+        for other in heard
+        if len(points) and other.log_nfa < SURE_LOG_NFA and not hypothesis.log_nfa < other.log_nfa
+    ]
+    reasons = (*solution.verdict.reasons, keypoints_apart(max(apart, default=0.0)))
+    moves = solution.verdict.outcome is Outcome.ALIGNED
+    return replace(solution, verdict=verdict(reasons, moves))
 
 
 def _better(one: Solution | None, other: Solution) -> Solution:

@@ -49,7 +49,7 @@ _FEWEST_MATCHES = 4
 _AFFINE_MATCHES = 12
 _CALM_SHARE = 0.8
 _CHANCE_LOG_NFA = -2.0
-_SURE_LOG_NFA = -12.0
+SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
 
 
@@ -201,7 +201,7 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
                 ground = _match_view(pair, images, _hidden(band, mine), dark_reference())
             doubt = _in_doubt(pair, ground, everywhere)
             agreed = [replace(hypothesis, bright=(mine, bright)) for hypothesis in doubt]
-        if any(hypothesis.log_nfa < _SURE_LOG_NFA for hypothesis in agreed):
+        if any(hypothesis.log_nfa < SURE_LOG_NFA for hypothesis in agreed):
             yield from agreed
             return
         found.extend(agreed)

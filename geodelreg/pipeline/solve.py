@@ -18,7 +18,7 @@ from geodelreg.match.delaunay_filter import star_filter
 from geodelreg.match.refine import RefineOptions
 from geodelreg.match.surface import make_surface
 from geodelreg.pipeline.accuracy import measure
-from geodelreg.pipeline.dense import Dense, Tuning, surface_sigma
+from geodelreg.pipeline.dense import Dense, surface_sigma
 from geodelreg.pipeline.evidence import (
     AreaEvidence,
     area_evidence,
@@ -30,6 +30,7 @@ from geodelreg.pipeline.evidence import (
 from geodelreg.pipeline.refinement import (
     COARSE_SIGMA,
     Refinement,
+    dark_tile,
     refine_densely,
     thread_count,
     working_tile,
@@ -189,7 +190,7 @@ def conclude(
     start = perf_counter()
     pair, estimate = part.pair, fitted.selection.estimate
     matrix = estimate.transformation.matrix
-    before, after, wide = _overlays(part, hypothesis, refined.tuning, matrix)
+    before, after, wide = _overlays(part, hypothesis, refined, matrix)
     accuracy = measure(part, fitted.points, fitted.selection, before, after)
     area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
     if area.log_chance > _SURE_LOG_CHANCE:
@@ -240,13 +241,15 @@ def tie_points(part: Roles, dense: Dense, matrix: FloatArray, status: StatusArra
 
 
 def _overlays(
-    part: Roles, hypothesis: Hypothesis, tuning: Tuning, matrix: FloatArray
+    part: Roles, hypothesis: Hypothesis, refined: Refinement, matrix: FloatArray
 ) -> tuple[Overlay, Overlay, Overlay]:
     """Both images, decimated, one on the other: under the header and under the correction.
 
     The third is the second with all that was read of the finer image.
     """
-    tile = working_tile(part, hypothesis.pair)
+    tile, tuning = working_tile(part, hypothesis.pair), refined.tuning
+    if refined.dark_only:
+        tile = dark_tile(part, tile, hypothesis)
     if part.ms_is_template():
         template, finer = tuning.tone(tile.template), tile.surface[0]
     else:

@@ -138,9 +138,9 @@ def _clip(low: FloatArray, high: FloatArray, grid: Grid) -> Window | None:
     return Window(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None
 
 
-def patch_size(region: Window) -> int:
-    """Side of a patch, in template pixels: smaller where the overlap is small."""
-    side = np.sqrt(region.width * region.height / _WANTED_PATCHES)
+def patch_size(visible_px: float) -> int:
+    """Side of a patch, in template pixels: smaller where few of them are to be seen."""
+    side = np.sqrt(visible_px / _WANTED_PATCHES)
     return int(np.clip(round(float(side)), SMALLEST_PATCH_PX, PATCH_PX))
 
 
@@ -155,7 +155,7 @@ def plan_tiles(region: Window, ratio: float) -> list[Window]:
         Surface pixels to a template pixel; tiles of many surface pixels are made smaller, so that
         all of them fit in memory.
     """
-    size = patch_size(region)
+    size = patch_size(region.width * region.height)
     patches = _SPREAD_TILE_PATCHES if ratio < _FINE_RATIO else _SPREAD_TILE_PATCHES_FINE
     columns = _spans(region.column, region.width, size, patches)
     rows = _spans(region.row, region.height, size, patches)

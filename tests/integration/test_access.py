@@ -82,7 +82,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
 
 
 def read_some(name: Path | str, allow: str = LOCAL) -> None:
-    with open_raster(name, allow) as reader:
+    with open_raster(name, allow=allow) as reader:
         height, width = reader.grid.shape
         reader.read([1], Window(0, 0, min(width, 64), min(height, 64)))
         assert reader.decimations
@@ -115,7 +115,7 @@ def test_no_request_is_sent_by_default(server: Server, address: str) -> None:
 def test_other_sources_are_refused_even_with_the_network(name: str) -> None:
     for allow in (LOCAL, NETWORK):
         with pytest.raises(AccessNotAllowedError, match="--allow all"):
-            open_raster(name, allow)
+            open_raster(name, allow=allow)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_archives_and_subdatasets_are_local(name: str) -> None:
 
 def test_allowed_addresses_are_asked_for(server: Server) -> None:
     with pytest.raises(RasterUnreadableError, match="cannot be opened"):
-        open_raster(f"/vsicurl/{server.address}/gone.tif", NETWORK)
+        open_raster(f"/vsicurl/{server.address}/gone.tif", allow=NETWORK)
     assert "/gone.tif" in server.requests
 
 

@@ -81,14 +81,10 @@ def clouded(tmp_path_factory: pytest.TempPathFactory) -> Clouded:
     return Clouded(scene, opacity_ms > 0.02, opacity > 0.02)
 
 
-def test_without_a_mask_the_ground_is_not_found(clouded: Clouded) -> None:
-    """What the masks are for: the cloud layer is the clearest motion in this scene."""
-    try:
-        alignment = align(clouded.scene.ms, clouded.scene.pan)
-    except AlignmentRefusedError:
-        return
-    parallax = float(np.hypot(*PARALLAX_PX))
-    assert clouded.scene.rmse_px(alignment.correction.corrected) == pytest.approx(parallax, abs=2)
+def test_clouds_over_two_fifths_do_not_win_without_a_mask(clouded: Clouded) -> None:
+    """Their layer is the clearest motion in this scene, 29 px from the ground."""
+    alignment = align(clouded.scene.ms, clouded.scene.pan)
+    assert clouded.scene.rmse_px(alignment.correction.corrected) < 0.1
 
 
 def test_a_mask_of_either_image_lets_the_ground_speak(clouded: Clouded, tmp_path: Path) -> None:

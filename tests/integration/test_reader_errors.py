@@ -216,7 +216,7 @@ def test_container_of_rasters_lists_them(tmp_path: Path) -> None:
 )
 def test_addresses_go_to_gdal(address: str) -> None:
     with pytest.raises(errors.RasterUnreadableError, match=r"cannot be opened.*Check the address"):
-        open_raster(address, ALL)
+        open_raster(address, allow=ALL)
 
 
 def test_paths_inside_archives_go_to_gdal(write_raster: WriteRaster, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -28,9 +28,12 @@ from geodelreg.pipeline.evidence import (
     rival_motion,
     widened,
 )
+from geodelreg.pipeline.register import heeding
+from geodelreg.pipeline.search import Hypothesis, WorkingPair, scopes
+from geodelreg.pipeline.solve import unsolved
 from geodelreg.pipeline.state import make_pair
 from geodelreg.pipeline.tiles import read_tiles, roles
-from geodelreg.types import Band, Grid, Status, TiePoints, Window
+from geodelreg.types import Band, Grid, Outcome, Status, TiePoints, Verdict, Window
 
 SIDE = 140
 GRID = Grid(
@@ -258,3 +261,32 @@ def test_rounding_of_a_constant_is_not_bright() -> None:
     data[::2] = np.nextafter(np.float32(1.0), np.float32(2.0))
     grid = Grid(Affine.identity(), data.shape, "")
     assert bright_mask(Band(data, np.ones(data.shape, dtype=bool), grid)) is None
+
+
+@pytest.mark.parametrize(
+    ("log_nfa_before", "log_nfa_own", "apart_px", "outcome"),
+    [
+        (-50.0, np.nan, 9.0, Outcome.REFUSED),
+        (-50.0, -20.0, 9.0, Outcome.REFUSED),
+        (-50.0, -80.0, 9.0, Outcome.ALIGNED),
+        (-5.0, np.nan, 9.0, Outcome.ALIGNED),
+        (-50.0, np.nan, 1.0, Outcome.ALIGNED),
+    ],
+)
+def test_stronger_keypoints_are_heeded_after_a_refusal(
+    log_nfa_before: float, log_nfa_own: float, apart_px: float, outcome: Outcome
+) -> None:
+    reader = ArrayReader((Band(texture(1), np.ones((SIDE, SIDE), dtype=bool), GRID),))
+    pair = make_pair(reader, reader, AlignOptions())
+    images = WorkingPair([], reader.bands[0], next(scopes(pair)))
+    elsewhere = IDENTITY + np.array([[0, 0, apart_px], [0, 0, 0]])
+    solution = replace(
+        unsolved(),
+        tie_points=tie_points(np.zeros((9, 2)), np.zeros(9, np.uint8)),
+        verdict=Verdict(Outcome.ALIGNED),
+    )
+    before = Hypothesis(elsewhere, log_nfa_before, {}, images)
+    own = Hypothesis(IDENTITY, log_nfa_own, {}, images)
+    heeded = heeding(pair, solution, own, [before])
+    assert heeded.verdict.outcome is outcome
+    assert heeded.verdict.reasons[-1].name == "keypoints_apart"
