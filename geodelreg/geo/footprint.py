@@ -85,7 +85,11 @@ def overlap_windows(
     if parts is None:
         return _lattice_windows(source, reference, grow_px, map_points)
     in_source, in_reference = parts
-    near = in_reference.buffer(grow_px) if grow_px > 0 else in_reference
+    # grown along both axes, as `in_source` is: a round buffer would miss what touches at a corner
+    near = in_reference
+    if grow_px > 0 and not in_reference.is_empty:
+        left, top, right, bottom = in_reference.bounds
+        near = box(left - grow_px, top - grow_px, right + grow_px, bottom + grow_px)
     windows = (
         _bounding_window(in_source.intersection(box(0, 0, *source.shape[::-1])), source.shape),
         _bounding_window(near.intersection(box(0, 0, *reference.shape[::-1])), reference.shape),

@@ -126,3 +126,13 @@ def test_footprint_torn_at_the_antimeridian_is_no_frame_around_the_rest() -> Non
     # straight edges in both CRSs: the torn outline is a valid polygon, 358 degrees wide
     mercator_150_east = grid(Affine(1000, 0, 3_228_000, 0, -1000, 4e5), (300, 222), 3832)
     assert footprint_in(mercator_150_east, WORLD, map_points) is None
+
+
+def test_grown_rasters_that_touch_at_a_corner_only_overlap() -> None:
+    """Further apart than the search radius along the diagonal, but not along either axis."""
+    reference = grid(Affine(10, 0, 500_000, 0, -10, 1_400_000), (50, 50), 32616)
+    source = grid(Affine(10, 0, 500_640, 0, -10, 1_399_360), (50, 50), 32616)
+    windows = overlap_windows(source, reference, 17.0, map_points)
+    assert windows is not None
+    assert windows[0].column == 0
+    assert windows[1].column + windows[1].width == 50
