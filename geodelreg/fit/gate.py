@@ -15,7 +15,8 @@ from geodelreg.options import AlignOptions
 from geodelreg.types import FloatArray, Outcome, Reason, Verdict
 
 MIN_POINTS = 8
-MAX_LOG_NFA = -4.0
+MAX_LOG_EACH = -2.0
+MAX_LOG_TOGETHER = -8.0
 MAX_SIGMA_PX = 0.7
 MIN_COVERAGE = 0.05
 MAX_DISAGREEMENT_PX = 1.0
@@ -86,13 +87,19 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     reasons = [
         _at_least("tie_points", evidence.points, MIN_POINTS, "tie points agree"),
         _at_most(
-            "log_nfa", evidence.log_nfa, MAX_LOG_NFA, "log10 of the expected chance agreements"
+            "log_nfa", evidence.log_nfa, MAX_LOG_EACH, "log10 of the expected chance agreements"
         ),
         _at_most(
             "log_chance",
             evidence.log_chance,
-            MAX_LOG_NFA,
+            MAX_LOG_EACH,
             "log10 of the chance that unrelated areas correlate so",
+        ),
+        _at_most(
+            "log_together",
+            evidence.log_nfa + evidence.log_chance,
+            MAX_LOG_TOGETHER,
+            "log10 of the chance of both, positions and likeness",
         ),
         _at_least("coverage", evidence.coverage, MIN_COVERAGE, "share of the overlap covered"),
         _at_most(

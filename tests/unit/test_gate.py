@@ -32,8 +32,8 @@ GOOD = Evidence(
     bands_apart=0.1,
 )
 UPPER = {
-    "log_nfa": gate.MAX_LOG_NFA,
-    "log_chance": gate.MAX_LOG_NFA,
+    "log_nfa": gate.MAX_LOG_EACH,
+    "log_chance": gate.MAX_LOG_EACH,
     "sigma_px": gate.MAX_SIGMA_PX,
     "disagreement_px": gate.MAX_DISAGREEMENT_PX,
     "rival": gate.MAX_RIVAL,
@@ -56,10 +56,18 @@ def outcome(evidence: Evidence, options: AlignOptions | None = None) -> Outcome:
     return verdict(judge(evidence, options or AlignOptions()), moves=True).outcome
 
 
+@pytest.mark.parametrize(("log_nfa", "log_chance"), [(-5.0, -2.9), (-2.5, -5.0)])
+def test_two_weak_kinds_of_evidence_are_not_enough(log_nfa: float, log_chance: float) -> None:
+    weak = replace(GOOD, log_nfa=log_nfa, log_chance=log_chance)
+    assert [r.name for r in judge(weak, AlignOptions()) if not r.passed] == ["log_together"]
+    assert outcome(replace(weak, log_nfa=-30.0 - log_chance)) is Outcome.ALIGNED
+
+
 def test_good_evidence_passes_every_reason() -> None:
     reasons = judge(GOOD, AlignOptions())
     assert all(reason.passed for reason in reasons)
-    assert len({reason.name for reason in reasons}) == len(reasons) == len(UPPER) + len(LOWER)
+    assert len({reason.name for reason in reasons}) == len(reasons)
+    assert len(reasons) == len(UPPER) + len(LOWER) + 1  # log_together is the sum of two
     assert outcome(GOOD) is Outcome.ALIGNED
     assert verdict(reasons, moves=False).outcome is Outcome.ALREADY_ALIGNED
 
