@@ -15,6 +15,8 @@ from geodelreg.types import BoolArray, Float32Array, FloatArray
 
 _PIXELS = 90_000
 _NEAR_PX = 8
+_PEAK_PX = 3
+_RIVALS = 5
 _RIVAL_OVERLAP = 0.2
 _BLOCK_PX = 32  # of the image magnified twice
 _UNSUSPICIOUS = 0.5
@@ -48,8 +50,8 @@ def rival_correlation(overlay: Overlay) -> float:
     """Best correlation at another displacement over that in place; 0 to about 1.
 
     Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
-    that the images alone cannot tell.  The rival is the displacement at which the whole correlates
-    best; it is judged block by block, so that fields of inverted contrast do not cancel out.
+    that the images alone cannot tell.  Rivals are the displacements at which the whole correlates
+    best; they are judged block by block, so that fields of inverted contrast do not cancel out.
 
     Returns
     -------
@@ -73,13 +75,23 @@ def rival_correlation(overlay: Overlay) -> float:
         return float("inf")
     near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
     scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
-    row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
-    moved = (middle_y - row, middle_x - column)
-    ratio = float(scores.max()) / in_place
-    if ratio < _UNSUSPICIOUS:
-        return ratio
-    by_block = _rival_blocks(one * one_mask, other * other_mask, moved)
-    return min(ratio, by_block) if np.isfinite(by_block) else ratio
+    rivals = []
+    for _ in range(_RIVALS):
+        row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
+        ratio = float(scores[row, column]) / in_place
+        if ratio < _UNSUSPICIOUS:
+            rivals.append(ratio)
+            break
+        moved = (middle_y - row, middle_x - column)
+        by_block = _rival_blocks(one * one_mask, other * other_mask, moved)
+        rivals.append(min(ratio, by_block) if np.isfinite(by_block) else ratio)
+        around = (_around(row, _PEAK_PX), _around(column, _PEAK_PX))
+        scores[around] = 0.0
+    return max(rivals)
+
+
+def _around(centre: int, reach: int) -> slice:
+    return slice(max(centre - reach, 0), centre + reach + 1)
 
 
 def _rival_blocks(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
