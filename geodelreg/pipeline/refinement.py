@@ -52,6 +52,7 @@ _CONTRADICTION_FLOOR_PX = 0.05
 _CALM_SHARE = 0.9
 _CALM_SIGMA_PX = 0.02
 _SHARPER_SHARE = 0.6
+_MUCH_VISIBLE = 0.75
 _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 
 
@@ -102,17 +103,19 @@ def refine_densely(
     tiles = read_tiles(part, plan_tiles(region, part.surface_px_per_template_px), matrix, threads)
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
-    options = RefineOptions(size=min(size, patch_size(_visible_px(tiles))))
+    options = RefineOptions(size=_size_for(tiles, size))
     refined = _of_the_ground(part, tiles, hypothesis, matrix, options) if tiles else None
     timings["refine"] = perf_counter() - start
     return refined
 
 
-def _visible_px(tiles: list[Tile]) -> float:
-    """Template pixels that both images show, about."""
-    return sum(
+def _size_for(tiles: list[Tile], size: int) -> int:
+    """Side of a patch, smaller than `size` where much is hidden and few patches would be left."""
+    area = sum(tile.template[0].valid.size for tile in tiles)
+    visible = sum(
         float(tile.template[0].valid.sum()) * float(tile.surface[0].valid.mean()) for tile in tiles
     )
+    return min(size, patch_size(visible)) if visible < _MUCH_VISIBLE * area else size
 
 
 def _of_the_ground(
@@ -130,7 +133,7 @@ def _of_the_ground(
     if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
         return everything
     hidden = [dark_tile(part, tile, hypothesis) for tile in tiles]
-    small = replace(options, size=min(options.size, patch_size(_visible_px(hidden))))
+    small = replace(options, size=_size_for(hidden, options.size))
     ground = _passes(part, hidden, matrix, small, (_HAZE, _PLAIN), _near_header(part, matrix))
     if ground is not None:
         ground = replace(ground, dark_only=True) if _kept(ground) >= _TELLING_PATCHES else None
