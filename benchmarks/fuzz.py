@@ -126,7 +126,7 @@ class Worker:
             if self.pipe.poll():
                 row: Row = self.pipe.recv()
                 return row | {"outcome": _judged(row)}
-        except EOFError:
+        except (EOFError, ConnectionResetError):
             self.process.join()
             return self._lost("crash", f"exit code {self.process.exitcode}: {self._last_words()}")
         waited = time.monotonic() - self.started
