@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
-from benchmarks.gate_pairs import Case, cases, is_there, make_pair
+from benchmarks.gate_cases import Case, cases, is_there
+from benchmarks.gate_pairs import make_pair
 from benchmarks.gate_report import false_accept, figure, page
 from benchmarks.report import replace_section
 from benchmarks.scenes import write_scene

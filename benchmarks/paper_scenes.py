@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from affine import Affine
 
-from benchmarks.gate_pairs import Case as GateCase
-from benchmarks.gate_pairs import imagery_of, textured_centre
+from benchmarks.gate_cases import Case as GateCase
+from benchmarks.gate_cases import imagery_of, textured_centre
 from benchmarks.gate_pairs import make_pair as make_gate_pair
 from benchmarks.imagery import SAMPLE_FOLDER, Imagery
 from benchmarks.scenes import HeaderError, Scene, SceneSpec, make_scene
