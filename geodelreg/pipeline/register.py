@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,11 +33,25 @@ from geodelreg.pipeline.search import (
 from geodelreg.pipeline.solve import Solution, solve, unsolved
 from geodelreg.pipeline.state import Pair, Progress, make_pair
 from geodelreg.pipeline.tiles import roles
-from geodelreg.types import Band, Correction, Outcome, WindowReader
+from geodelreg.types import Band, Correction, FloatArray, Outcome, WindowReader
 
 logger = logging.getLogger(__name__)
 
 _FAIR_SHARE = 0.5
+
+
+class Claim(NamedTuple):
+    """What is remembered of a hypothesis that was refused: not its images.
+
+    Attributes
+    ----------
+    matrix : (2, 3) float64
+        MS pixels to MS header pixels.
+    log_nfa : float
+    """
+
+    matrix: FloatArray
+    log_nfa: float
 
 
 def register(
@@ -75,7 +90,7 @@ def register(
     pair = make_pair(source, reference, options)
     start = perf_counter()
     refused: Solution | None = None
-    heard: list[Hypothesis] = []
+    heard: list[Claim] = []
     looked = 0.0
     report(0.02, "reading")
     for seen, hypothesis in hypotheses(pair):
@@ -91,7 +106,7 @@ def register(
                 report(1.0, "done")
                 return seen, solution
             refused = _better(refused, solution)
-        heard.append(hypothesis)
+        heard.append(Claim(hypothesis.matrix, hypothesis.log_nfa))
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
     if refused is None:
@@ -184,9 +199,7 @@ def _finish(pair: Pair, solution: Solution, found_s: dict[str, float]) -> Soluti
     )
 
 
-def heeding(
-    pair: Pair, solution: Solution, hypothesis: Hypothesis, heard: list[Hypothesis]
-) -> Solution:
+def heeding(pair: Pair, solution: Solution, hypothesis: Hypothesis, heard: list[Claim]) -> Solution:
     """The solution, judged also by keypoints that agree with more certainty than its own.
 
     They were refused, where too little is in sight or clouds are about; that makes a place which

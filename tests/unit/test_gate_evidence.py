@@ -28,7 +28,7 @@ from geodelreg.pipeline.evidence import (
     rival_motion,
     widened,
 )
-from geodelreg.pipeline.register import heeding
+from geodelreg.pipeline.register import Claim, heeding
 from geodelreg.pipeline.search import Hypothesis, WorkingPair, scopes
 from geodelreg.pipeline.solve import unsolved
 from geodelreg.pipeline.state import make_pair
@@ -298,7 +298,7 @@ def test_stronger_keypoints_are_heeded_after_a_refusal(
         tie_points=tie_points(np.zeros((9, 2)), np.zeros(9, np.uint8)),
         verdict=Verdict(Outcome.ALIGNED),
     )
-    before = Hypothesis(elsewhere, log_nfa_before, {}, images)
+    before = Claim(elsewhere, log_nfa_before)
     own = Hypothesis(IDENTITY, log_nfa_own, {}, images)
     heeded = heeding(pair, solution, own, [before])
     assert heeded.verdict.outcome is outcome
