@@ -410,3 +410,10 @@ def test_sequence_of_features_is_read_as_rio_prints_it(tmp_path: Path) -> None:
     found, crs_wkt = read_gcps(path)
     assert found == make.points()
     assert CRS.from_wkt(crs_wkt).equals(CRS.from_wkt(UTM16))
+
+
+def test_points_beyond_the_globe_have_no_geojson(tmp_path: Path) -> None:
+    first, *others = make.points()
+    points = (replace(first, x=1e30), *others)
+    with pytest.raises(GcpFormatError, match="no place in WGS 84"):
+        write_gcps(tmp_path / "points.geojson", points, context=oracle_context())

@@ -158,5 +158,5 @@ def crs_wkt_of(name: str) -> str:
 
     try:
         return str(CRS.from_string(name).to_wkt(version="WKT2_2019"))
-    except CRSError as error:
+    except (CRSError, ValueError) as error:  # rasterio lets what int() and split() say through
         raise GcpFormatError(f"its CRS {name!r} is unknown") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,27 @@ _RECORD_SEPARATOR = "\x1e"
 
 
 def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
-    """Text of a feature collection."""
+    """Text of a feature collection.
+
+    Raises
+    ------
+    GcpFormatError
+        If a point lies outside what its CRS can express.
+    """
     from rasterio.crs import CRS
 
     crs_wkt = context.source.crs_wkt
     positions = map_points(ground_of(gcps), crs_wkt, CRS.from_epsg(4326).to_wkt())
+    nowhere = [
+        gcp.id
+        for gcp, position in zip(gcps, positions.tolist(), strict=True)
+        if not all(map(math.isfinite, position))
+    ]
+    if nowhere:
+        raise GcpFormatError(
+            f"the map coordinates of point {nowhere[0]} have no place in WGS 84, as GeoJSON needs",
+            "Correct them, or write another format.",
+        )
     name = crs_name(crs_wkt)
     features = [
         _feature(gcp, longitude, latitude, name)

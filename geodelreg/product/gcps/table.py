@@ -34,7 +34,13 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     GcpFormatError
         If a required field is missing or a value is no number.
     """
-    reader = csv.DictReader(io.StringIO(text, newline=""))
+    try:
+        return _decoded(csv.DictReader(io.StringIO(text, newline="")))
+    except csv.Error as error:
+        raise GcpFormatError(f"it is no CSV text ({error})") from error
+
+
+def _decoded(reader: csv.DictReader[str]) -> Decoded:
     names = {name.strip().lower(): name for name in reader.fieldnames or ()}
     missing = [name for name in _REQUIRED if name not in names]
     if missing:
