@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,8 @@ _COMMON_PIXELS = 100_000_000
 _LARGEST_SIDE = 100_000_000
 # the densest lossless codecs of TIFF do not reach this
 _PIXELS_PER_BYTE = 20_000
+# share of a pixel that map coordinates may be rounded by
+_ROUNDED = 1e-3
 
 
 def open_dataset(path: str, overview_level: int | None = None, allow: str = LOCAL) -> DatasetReader:
@@ -171,6 +174,14 @@ def _check_transform(path: str, transform: Affine, has_gcps: bool, has_rpcs: boo
     if abs(transform.determinant) <= 1e-9 * across * down or min(across, down) == 0:
         raise UnsupportedGeoreferenceError(
             f"the geotransform of {path} is degenerate: its pixels have no area {values}",
+            "Assign a valid one: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
+        )
+    if max(abs(transform.c), abs(transform.f)) * sys.float_info.epsilon > _ROUNDED * min(
+        across, down
+    ):
+        raise UnsupportedGeoreferenceError(
+            f"the geotransform of {path} puts it so far away that pixels cannot be told apart: "
+            f"{values}",
             "Assign a valid one: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
         )
 

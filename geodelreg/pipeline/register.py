@@ -96,6 +96,8 @@ def register(
     for seen, hypothesis in hypotheses(pair):
         report(0.4 + looked / 4, "refining")
         found = perf_counter() - start
+        if affine_from_matrix(hypothesis.matrix).is_degenerate:
+            continue  # of headers that squeeze the ground to a line
         run = solve if options.method == "delaunay" else solve_baseline
         solution = run(seen, hypothesis)
         if solution is not None:

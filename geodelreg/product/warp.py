@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
+from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
@@ -169,7 +170,15 @@ def _target_grid(
         grid = reference
     else:
         with rasterio.open(source) as dataset:
-            grid = north_up_grid(correction, dataset.shape)
+            shape = dataset.shape
+        try:
+            grid = north_up_grid(correction, shape)
+        except (OverflowError, ValueError) as error:
+            raise UnsupportedGeoreferenceError(
+                f"the corrected geotransform of {source} is too large to be covered by pixels: "
+                f"{tuple(correction.corrected)[:6]}",
+                "Check the geotransform with gdalinfo, or use --grid pan.",
+            ) from error
     return grid
 
 

@@ -225,3 +225,11 @@ def test_paths_inside_archives_go_to_gdal(write_raster: WriteRaster, tmp_path: P
         archive.write(path, "inside.tif")
     open_and_read(f"/vsizip/{tmp_path}/a.zip/inside.tif")
     open_and_read(f"zip://{tmp_path}/a.zip!inside.tif")
+
+
+def test_a_raster_beyond_the_precision_of_its_coordinates_is_refused(
+    write_raster: WriteRaster,
+) -> None:
+    far = Affine(15.0, -5.0, 1e30, -5.0, -15.0, 0.0)
+    path = write_raster("far.tif", np.ones((8, 8), np.uint8), transform=far)
+    assert_refused(path, errors.UnsupportedGeoreferenceError, "cannot be told apart")

@@ -13,7 +13,12 @@ import rasterio
 from affine import Affine
 from rasterio.enums import ColorInterp, MaskFlags
 
-from geodelreg.errors import LossyOutputError, OutputExistsError, OutputIsInputError
+from geodelreg.errors import (
+    LossyOutputError,
+    OutputExistsError,
+    OutputIsInputError,
+    UnsupportedGeoreferenceError,
+)
 from geodelreg.options import WriteOptions
 from geodelreg.product.warp import north_up_grid, write_warped
 from geodelreg.types import Correction, Grid
@@ -274,3 +279,14 @@ def test_refusals_leave_nothing(tmp_path: Path) -> None:
             source, tmp_path / "out.jpg", correction, UNUSED, TAGS, WriteOptions(warp=True)
         )
     assert names(tmp_path) == {"ms.tif", "there.tif"}
+
+
+def test_pixels_too_large_for_a_grid_are_refused(tmp_path: Path) -> None:
+    source = write_ramps(tmp_path / "ms.tif")
+    tall = Affine(10.0, 0.0, 500_000.0, 0.0, -1e-310, 4e6)
+    correction = Correction("affine", UTM18, tall, Affine.translation(0, 1e5) @ tall)
+    with pytest.raises(UnsupportedGeoreferenceError, match=r"ms\.tif is too large"):
+        write_warped(
+            source, tmp_path / "out.tif", correction, UNUSED, TAGS, WriteOptions(warp=True)
+        )
+    assert names(tmp_path) == {"ms.tif"}
