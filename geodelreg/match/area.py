@@ -6,6 +6,7 @@ doi:10.1109/TIP.2011.2181402).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -75,18 +76,18 @@ def rival_correlation(overlay: Overlay) -> float:
         return float("inf")
     near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
     scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
-    rivals = []
+    rivals: list[float] = []
+    by_block: Callable[[int, int], float] | None = None
     for _ in range(_RIVALS):
         row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
         ratio = float(scores[row, column]) / in_place
         if ratio < _UNSUSPICIOUS:
             rivals.append(ratio)
             break
-        moved = (middle_y - row, middle_x - column)
-        by_block = _rival_blocks(one * one_mask, other * other_mask, moved)
-        rivals.append(min(ratio, by_block) if np.isfinite(by_block) else ratio)
-        around = (_around(row, _PEAK_PX), _around(column, _PEAK_PX))
-        scores[around] = 0.0
+        by_block = by_block or _rival_blocks(one, other)
+        in_blocks = by_block(middle_y - row, middle_x - column)
+        rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
+        scores[_around(row, _PEAK_PX), _around(column, _PEAK_PX)] = 0.0
     return max(rivals)
 
 
@@ -94,8 +95,8 @@ def _around(centre: int, reach: int) -> slice:
     return slice(max(centre - reach, 0), centre + reach + 1)
 
 
-def _rival_blocks(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
-    """Like `rival_correlation`, of the blocks' correlations with any sign, for one displacement.
+def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int], float]:
+    """Like `rival_correlation`, of the blocks' correlations with any sign, for a displacement.
 
     Displacements are tried to half a pixel, so that a period of no whole number fits; NaN where
     no block can be compared.
@@ -108,7 +109,7 @@ def _rival_blocks(one: Float32Array, other: Float32Array, moved: tuple[int, int]
         return max(_block_correlation(first, second, (2 * dy + y, 2 * dx + x)) for y, x in around)
 
     here = best(0, 0)
-    return best(*moved) / here if here > 0 else float("nan")
+    return lambda dy, dx: best(dy, dx) / here if here > 0 else float("nan")
 
 
 def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
