@@ -251,7 +251,7 @@ def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
         warnings=solution.warnings,
         crs_operation=pair.mapping.operation.description,
         options=pair.options,
-        versions=versions(),
+        versions=versions(with_proj=pair.mapping.matrix is None),
         timings_s=solution.timings_s,
         masks=mask_uses(rasters.ms, rasters.pan),
     )

@@ -48,11 +48,14 @@ class Grid:
         ``(height, width)`` in pixels.
     crs_wkt : str
         Coordinate reference system as WKT2; map axes are in (easting, northing) order.
+    unit_m : float or None
+        Metres to a map unit if whoever opened the raster knew; else look it up in `crs_wkt`.
     """
 
     transform: Affine
     shape: tuple[int, int]
     crs_wkt: str
+    unit_m: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,10 +366,7 @@ class Alignment:
     source_paths : tuple of str
         MS file, or one file per band.
     reference_path : str
-    correction : Correction
-    tie_points : TiePoints
-    accuracy : Accuracy
-    verdict : Verdict
+    correction, tie_points, accuracy, verdict : as their types say
     step_counts : dict of str to int
         Points that survive each step, in order; the paper's "112 → 97 → 91".
     band_weights : dict of str to float

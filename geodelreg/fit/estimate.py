@@ -13,7 +13,8 @@ _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _STUDENT_DOF = 6.0
 _REJECT_D2 = 25.0
 _SPREAD_ROUNDS = 6
-_BISECTIONS = 16
+_MOST_STEPS = 16
+_CLOSE = 1e-4
 _MOST_LEVERAGE = 0.95
 
 
@@ -98,8 +99,18 @@ def weighted_fit(
     parameters : (k,) float64
     normal : (k, k) float64
     """
+    return _solve(*_system(model, points, frame), weight, frame)
+
+
+def _system(model: str, points: Observations, frame: Frame) -> tuple[FloatArray, FloatArray]:
+    """(N, 2, k) columns and (N, 2) right side of the equations."""
     columns, base = design(model, points.source, frame)
-    right = frame.normalise(points.target) - base
+    return columns, frame.normalise(points.target) - base
+
+
+def _solve(
+    columns: FloatArray, right: FloatArray, weight: FloatArray, frame: Frame
+) -> tuple[FloatArray, FloatArray]:
     weighted = np.matmul(weight * frame.span_px**2, columns)
     normal = np.einsum("nik,nil->kl", columns, weighted)
     moment = np.einsum("nik,ni->k", weighted, right)
@@ -136,15 +147,16 @@ def robust_fit(
         raise ValueError(f"{len(points)} points cannot determine a {model}")
     extra = extra_variance_px2 or 0.0
     variances, axes = np.linalg.eigh(points.covariance)
+    columns, right = _system(model, points, frame)
     student = np.ones(len(points))
     previous = None
     for number in range(20):
-        inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
-        parameters, normal = weighted_fit(model, points, inverse * student[:, None, None], frame)
+        inverse = _inverse(points.covariance, extra)
+        parameters, normal = _solve(columns, right, inverse * student[:, None, None], frame)
         residual = transformation(model, parameters, frame).residuals(points.source, points.target)
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = _variance_left(residual, variances, axes)
-            inverse = np.linalg.inv(points.covariance + extra * np.eye(2))
+            inverse = _inverse(points.covariance, extra)
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
         student = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
         if previous is not None and np.abs(parameters - previous).max() < 1e-9:
@@ -157,6 +169,17 @@ def robust_fit(
         transformation(model, parameters, frame),
         parameters, sandwich, frame, extra, inlier, distance2,
     )  # fmt: skip
+
+
+def _inverse(covariance: FloatArray, extra: float) -> FloatArray:
+    """(N, 2, 2) inverses of covariances to which a common variance is added."""
+    a, d = covariance[:, 0, 0] + extra, covariance[:, 1, 1] + extra
+    b = covariance[:, 0, 1]
+    inverse = np.empty_like(covariance)
+    determinant = a * d - b * b
+    inverse[:, 0, 0], inverse[:, 1, 1] = d / determinant, a / determinant
+    inverse[:, 0, 1] = inverse[:, 1, 0] = -b / determinant
+    return inverse
 
 
 def _sandwich(
@@ -214,13 +237,22 @@ def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray
     def median_at(extra: float) -> float:
         return _median(one / (first + extra) + other / (second + extra))
 
-    if median_at(0.0) <= _MEDIAN_CHI2_2:
-        return 0.0
     low, high = 0.0, _median((residual**2).sum(axis=1)) + 1e-12
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if median_at(middle) > _MEDIAN_CHI2_2 else (low, middle)
-    return high
+    at_low = 1.0 - _MEDIAN_CHI2_2 / max(median_at(low), 1e-300)
+    if at_low <= 0.0:
+        return 0.0
+    at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), 1e-300)
+    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick
+    for _ in range(_MOST_STEPS):
+        middle = high - at_high * (high - low) / (at_high - at_low)
+        here = 1.0 - _MEDIAN_CHI2_2 / median_at(middle)
+        if abs(here) < _CLOSE:
+            return float(middle)
+        if here > 0.0:
+            low, at_low, at_high = middle, here, at_high / 2
+        else:
+            high, at_high, at_low = middle, here, at_low / 2
+    return float(high)
 
 
 def _median(values: FloatArray) -> float:

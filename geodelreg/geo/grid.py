@@ -66,9 +66,12 @@ def gsd_px_m(grid: Grid) -> tuple[float, float]:
         If PROJ does not understand the CRS.
     """
     height, width = grid.shape
-    transform, crs = grid.transform, _crs(grid.crs_wkt)
-    if not crs.is_geographic:
-        unit_m = _unit_m(crs)
+    transform = grid.transform
+    # loading PROJ takes longer than all else here
+    crs = _crs(grid.crs_wkt) if grid.unit_m is None else None
+    if crs is None or not crs.is_geographic:
+        unit_m = grid.unit_m if crs is None else _unit_m(crs)
+        assert unit_m is not None
         return (
             unit_m * math.hypot(transform.a, transform.d),
             unit_m * math.hypot(transform.b, transform.e),

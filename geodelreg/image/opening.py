@@ -25,6 +25,7 @@ from geodelreg.image.vrt_sources import check_regular, check_vrt_sources, is_vrt
 from geodelreg.types import Grid
 
 if TYPE_CHECKING:
+    from rasterio.crs import CRS
     from rasterio.io import DatasetReader
 
 logger = logging.getLogger(__name__)
@@ -157,7 +158,7 @@ def dataset_grid(path: str, dataset: DatasetReader) -> Grid:
             f"{path} has no coordinate reference system",
             "Assign the right one: gdal_edit.py -a_srs EPSG:… FILE (or rio edit-info --crs).",
         )
-    return Grid(transform, (dataset.height, dataset.width), _wkt2(crs))
+    return Grid(transform, (dataset.height, dataset.width), _wkt2(crs), _unit_m(crs))
 
 
 def _check_transform(path: str, transform: Affine, has_gcps: bool, has_rpcs: bool) -> None:
@@ -201,6 +202,17 @@ def _raise_without_geotransform(path: str, has_gcps: bool, has_rpcs: bool) -> No
         f"{path} has no geotransform",
         "Give it a rough one first: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE, or a world file.",
     )
+
+
+def _unit_m(crs: CRS) -> float | None:
+    """Metres to a map unit of a projected CRS; None of others, and where GDAL cannot tell."""
+    from rasterio.errors import CRSError
+
+    with gdal_calls():
+        try:
+            return float(crs.linear_units_factor[1]) if crs.is_projected else None
+        except CRSError:
+            return None
 
 
 def _wkt2(crs: object) -> str:

@@ -46,6 +46,16 @@ class Overlay:
         """(H, W) bool, True where both are valid."""
         return self.template_valid & self.surface_valid
 
+    def part(self, rows: slice, columns: slice) -> Overlay:
+        """A window of the overlay."""
+        where = (rows, columns)
+        return Overlay(
+            self.template[where],
+            self.surface[where],
+            self.template_valid[where],
+            self.surface_valid[where],
+        )
+
 
 def rival_correlation(overlay: Overlay) -> float:
     """Best correlation at another displacement over that in place; 0 to about 1.
@@ -67,7 +77,8 @@ def rival_correlation(overlay: Overlay) -> float:
     common = float((one_mask * other_mask).sum())
     if small or common < 1000:
         return float("nan")
-    scores = _masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
+    signed, _ = _masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
+    scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
     reach = 1
     here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
@@ -136,7 +147,10 @@ def _blocks(image: Float32Array) -> FloatArray:
 
 
 def best_shift(overlay: Overlay) -> FloatArray:
-    """Displacement at which the edges of the two images correlate best.
+    """Displacement at which the edges of the two images correlate most significantly.
+
+    Of two displacements that of larger overlap may have the smaller correlation and yet be the less
+    likely by chance: what counts is the correlation in units of its own scatter, r √n.
 
     Parameters
     ----------
@@ -152,7 +166,8 @@ def best_shift(overlay: Overlay) -> FloatArray:
     one, one_mask = _edges(*_detail(overlay.template, overlay.template_valid, scale))
     other, other_mask = _edges(*_detail(overlay.surface, overlay.surface_valid, scale))
     least = _SEARCH_OVERLAP * float(min(one_mask.sum(), other_mask.sum()))
-    scores = _masked_correlation(one, one_mask, other, other_mask, least)
+    scores, overlap = _masked_correlation(one, one_mask, other, other_mask, least)
+    scores *= np.sqrt(np.maximum(overlap, 0.0))
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     height, width = one.shape
     moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
@@ -196,8 +211,11 @@ def _masked_correlation(
     other: Float32Array,
     other_mask: Float32Array,
     least_overlap: float,
-) -> Float32Array:
-    """(2 H − 1, 2 W − 1) normalised |correlation|; 0 where fewer than `least_overlap` pixels."""
+) -> tuple[Float32Array, Float32Array]:
+    """(2 H − 1, 2 W − 1) normalised correlation and common pixels of all displacements.
+
+    The correlation is 0 where fewer than `least_overlap` pixels are common.
+    """
     height, width = one.shape
     shape = (cv2.getOptimalDFTSize(2 * height - 1), cv2.getOptimalDFTSize(2 * width - 1))
 
@@ -219,4 +237,4 @@ def _masked_correlation(
     power_other = correlate(mask_a, spectrum(other * other))
     enough = overlap > least_overlap
     power = np.sqrt(np.maximum(power_one * power_other, 1e-6))
-    return np.asarray(np.where(enough, np.abs(together) / power, 0.0), dtype=np.float32)
+    return np.asarray(np.where(enough, together / power, 0.0), dtype=np.float32), overlap

@@ -1,4 +1,4 @@
-"""The one similarity or affine that many matches agree on, and how surprising that agreement is."""
+"""The one similarity or affine that many matches agree on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from geodelreg.types import BoolArray, FloatArray, IntArray, Keypoints, Matches
 SAMPLE_SIZE = {"similarity": 2, "affine": 3}
 SAMPLES = {"similarity": (2,), "affine": (2, 3)}
 MAX_STRETCH = 8.0
-RESIDUAL_FLOOR_PX = 0.1
 
 _SCORED_MATCHES = 1000
 _SAMPLES_PER_ROUND = 300
@@ -55,7 +54,7 @@ def consensus_affine(
     ratios more often (after Chum & Matas 2005, doi:10.1109/CVPR.2005.221) and refits the best
     hypotheses to their inliers (Chum et al. 2003, doi:10.1007/978-3-540-45243-0_31).  Mirroring
     and scales beyond 1:8 are not considered.  Always returns the best it saw: judge it by
-    `log_nfa`.
+    `geodelreg.match.surprise.log_nfa`.
 
     Parameters
     ----------
@@ -148,57 +147,6 @@ def consensus_keypoints(
     return paired if paired.inliers.sum() >= sampled.inliers.sum() else sampled
 
 
-def log_nfa(
-    residual_px: FloatArray, area_px2: float, sample_size: int, max_residual_px: float = math.inf
-) -> tuple[float, float]:
-    """Expected number of chance agreements as good as this one (number of false alarms).
-
-    A contrario model: matched points fall anywhere in the reference, uniformly and independently
-    (Moisan & Stival 2004, doi:10.1023/B:VISI.0000013094.38752.5c; the form of Moulon, Monasse &
-    Marlet 2012, doi:10.1007/978-3-642-37447-0_20).  Below 0 (less than one false alarm), agreement
-    is unlikely to be chance; a gate should ask for much less.
-
-    Parameters
-    ----------
-    residual_px : (M,) float64
-        Radial residuals of all one-to-one matches that were available to the search, outliers too.
-    area_px2 : float
-        Area of the reference in which the matches could fall.
-    sample_size : int
-        Matches that fix the model: 1 for a shift, 2 for a similarity, 3 for an affine.
-    max_residual_px : float
-        Largest inlier threshold considered.
-
-    Returns
-    -------
-    log10_nfa : float
-        Minimum over the inlier thresholds; ``inf`` when there are no more matches than
-        `sample_size`.
-    threshold_px : float
-        Where it is reached; NaN when it is not.
-    """
-    residual = np.sort(np.maximum(residual_px, RESIDUAL_FLOOR_PX))
-    count = len(residual)
-    inliers = np.arange(sample_size + 1, count + 1)
-    inliers = inliers[residual[inliers - 1] <= max_residual_px]
-    if len(inliers) == 0:
-        return math.inf, math.nan
-    log_factorial = np.concatenate([[0.0], np.cumsum(np.log10(np.arange(1, count + 1)))])
-
-    def log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
-        return np.asarray(log_factorial[n] - log_factorial[k] - log_factorial[np.subtract(n, k)])
-
-    probability = np.minimum(np.pi * residual[inliers - 1] ** 2 / area_px2, 1.0)
-    log_counts = (
-        math.log10(count - sample_size)
-        + log_choose(count, inliers)
-        + log_choose(inliers, sample_size)
-        + (inliers - sample_size) * np.log10(probability)
-    )
-    best = int(log_counts.argmin())
-    return float(log_counts[best]), float(residual[inliers[best] - 1])
-
-
 def transform_points(matrix: FloatArray, xy: FloatArray) -> FloatArray:
     """(M, 2) float64, points under a (2, 3) transformation."""
     # Written out: a matrix product may round differently from one thread count to another.
@@ -224,17 +172,8 @@ def fit_matrix(source_xy: FloatArray, reference_xy: FloatArray, kind: str) -> Fl
     kind : str
         ``similarity`` or ``affine``.
     """
-    source_mean, reference_mean = source_xy.mean(axis=0), reference_xy.mean(axis=0)
-    s, r = source_xy - source_mean, reference_xy - reference_mean
-    if kind == "similarity":
-        power = max(float((s * s).sum()), np.finfo(np.float64).tiny)
-        along = float((s * r).sum()) / power
-        across = float((s[:, 0] * r[:, 1] - s[:, 1] * r[:, 0]).sum()) / power
-        linear = np.array([[along, -across], [across, along]])
-    else:
-        normal = np.einsum("mi,mj->ij", s, s)
-        linear = np.linalg.lstsq(normal, np.einsum("mi,mj->ij", s, r), rcond=None)[0].T
-    return np.column_stack([linear, reference_mean - linear @ source_mean])
+    every = np.ones((1, len(source_xy)), dtype=np.bool_)
+    return np.asarray(_fitted(source_xy, reference_xy, every, kind)[0])
 
 
 def _nothing(count: int) -> Consensus:
@@ -382,18 +321,40 @@ def _refined(
     kind: str,
 ) -> Consensus:
     """Refit each hypothesis to its inliers under a shrinking threshold; the one with most wins."""
-    best, best_score = _nothing(len(source_xy)), -1.0
-    for hypothesis in hypotheses:
-        matrix = hypothesis
-        for loosening in _LOOSENING:
-            near = radial_residuals(matrix, source_xy, reference_xy) < loosening * threshold_px
-            if near.sum() <= SAMPLE_SIZE[kind]:
-                break
-            matrix = fit_matrix(source_xy[near], reference_xy[near], kind)
-        if not _plausible(matrix[None])[0]:
-            continue
-        score = float(_scores(matrix[None], source_xy, reference_xy, threshold_px)[0])
-        if score > best_score:
-            inliers = radial_residuals(matrix, source_xy, reference_xy) <= threshold_px
-            best, best_score = Consensus(matrix, inliers), score
-    return best
+    reach2 = threshold_px**2
+    matrices, growing = hypotheses.copy(), np.arange(len(hypotheses))
+    for loosening in _LOOSENING:
+        squared = _squared_residuals(matrices[growing], source_xy, reference_xy)
+        near = squared < loosening**2 * reach2
+        enough = near.sum(axis=1) > SAMPLE_SIZE[kind]
+        growing, near = growing[enough], near[enough]
+        if not len(growing):
+            break
+        matrices[growing] = _fitted(source_xy, reference_xy, near, kind)
+    matrices = matrices[_plausible(matrices)]
+    if not len(matrices):
+        return _nothing(len(source_xy))
+    best = matrices[int(_scores(matrices, source_xy, reference_xy, threshold_px).argmax())]
+    return Consensus(best, radial_residuals(best, source_xy, reference_xy) <= threshold_px)
+
+
+def _fitted(source: FloatArray, reference: FloatArray, near: BoolArray, kind: str) -> FloatArray:
+    """(S, 2, 3) `fit_matrix` of the points that are near each of S hypotheses, (S, M)."""
+    weight = near.astype(np.float64)
+    total = weight.sum(axis=1)[:, None]
+    # einsum, for BLAS may round differently from one thread count to another
+    source_mean, reference_mean = (
+        np.einsum("sm,mk->sk", weight, xy) / total for xy in (source, reference)
+    )
+    s, r = source - source_mean[:, None], reference - reference_mean[:, None]
+    s *= weight[:, :, None]
+    across = np.matmul(s.transpose(0, 2, 1), r)
+    normal = np.matmul(s.transpose(0, 2, 1), s)
+    if kind == "similarity":
+        power = np.maximum(normal[:, 0, 0] + normal[:, 1, 1], np.finfo(np.float64).tiny)
+        along = (across[:, 0, 0] + across[:, 1, 1]) / power
+        turn = (across[:, 0, 1] - across[:, 1, 0]) / power
+        return _similarities(along, turn, source_mean, reference_mean)
+    linear = np.matmul(np.linalg.pinv(normal, hermitian=True), across).transpose(0, 2, 1)
+    offset = reference_mean - np.einsum("sij,sj->si", linear, source_mean)
+    return np.concatenate([linear, offset[:, :, None]], axis=2)

@@ -22,11 +22,11 @@ from geodelreg.match.consensus import (
     Consensus,
     consensus_affine,
     fit_matrix,
-    log_nfa,
     radial_residuals,
     transform_points,
 )
 from geodelreg.match.star import Field, Prediction, own_stars, predict, stars_of
+from geodelreg.match.surprise import log_nfa
 from geodelreg.types import BoolArray, FloatArray, IntArray, Status
 
 _MEDIAN = 2 * np.log(2)  # of squared distances over variances, in the plane

@@ -8,7 +8,7 @@ Ackermann 1984; with the linear regression form, template noise alone enters the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -87,6 +87,8 @@ class Patches:
         Template raster pixels per patch pixel along columns and rows (1 unless decimated).
     size : int
         n.
+    owner : (P,) intp
+        Which of several surfaces each patch is matched on, in ascending order.
     """
 
     centre: FloatArray
@@ -94,6 +96,7 @@ class Patches:
     valid: BoolArray
     step: FloatArray
     size: int
+    owner: IntArray
 
     def __len__(self) -> int:
         return len(self.centre)
@@ -105,6 +108,7 @@ class Patches:
             centre=self.centre[chosen],
             values=self.values[chosen],
             valid=self.valid[chosen],
+            owner=self.owner[chosen],
         )
 
 
@@ -163,21 +167,36 @@ def cut_patches(bands: list[Band], full: Grid, size: int) -> Patches:
     centre = np.stack(
         [to_full.a * centre[:, 0] + to_full.c, to_full.e * centre[:, 1] + to_full.f], axis=1
     )
-    return Patches(centre, values, valid, np.array([to_full.a, to_full.e]), size)
+    owner = np.zeros(len(centre), dtype=np.intp)
+    return Patches(centre, values, valid, np.array([to_full.a, to_full.e]), size, owner)
+
+
+def gather(parts: Sequence[Patches]) -> Patches:
+    """Patches of one size from several places, the surface of each with the number of its part."""
+    first = parts[0]
+    return Patches(
+        np.concatenate([part.centre for part in parts]),
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.valid for part in parts]),
+        first.step,
+        first.size,
+        np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+    )
 
 
 def refine(
     patches: Patches,
-    surface: Surface,
+    surfaces: Sequence[Surface],
     mapping: Callable[[FloatArray], FloatArray],
     options: RefineOptions,
 ) -> Refined:
-    """Match patches on a surface.
+    """Match patches, each on its surface.
 
     Parameters
     ----------
     patches : Patches
-    surface : Surface
+    surfaces : sequence of Surface
+        What `Patches.owner` refers to.
     mapping : callable
         The current transformation: template raster pixels (..., 2) to surface raster pixels.
     options : RefineOptions
@@ -199,7 +218,7 @@ def refine(
     for _ in range(options.iterations):
         if not len(active):
             break
-        step = _gauss_newton(patches, surface, local, offsets, move, active)
+        step = _gauss_newton(patches, surfaces, local, offsets, move, active)
         move[active] += step.move
         covariance[active], correlation[active] = step.covariance, step.correlation
         share[active] = step.usable_share
@@ -229,7 +248,7 @@ class _Step:
 
 def _gauss_newton(
     patches: Patches,
-    surface: Surface,
+    surfaces: Sequence[Surface],
     local: FloatArray,
     offsets: FloatArray,
     move: FloatArray,
@@ -239,7 +258,7 @@ def _gauss_newton(
     n, side = patches.size, patches.size + 2 * _MARGIN
     linear = local[active, :, :2] * patches.step
     anchor = local[active, :, 2] + np.einsum("pij,pj->pi", linear, move[active])
-    values, usable = sample_patches(surface, anchor, linear, offsets)
+    values, usable = sample_patches(surfaces, patches.owner[active], anchor, linear, offsets)
     image = values.reshape(-1, side, side)
     good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
     good = good & patches.valid[active]

@@ -7,14 +7,17 @@ a sample (Sigg & Hadwiger 2005, GPU Gems 2, chapter 20).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
 
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.pixel import corner_to_centre
-from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid
+from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Grid, IntArray
 
 _POLE = np.sqrt(3.0) - 2.0
 _PREFILTER_RADIUS = 8
@@ -163,17 +166,27 @@ def sample(surface: Surface, xy: FloatArray) -> tuple[Float32Array, BoolArray]:
     m = surface.to_window
     x = m[0, 0] * xy[..., 0] + m[0, 1] * xy[..., 1] + m[0, 2]
     y = m[1, 0] * xy[..., 0] + m[1, 1] * xy[..., 1] + m[1, 2]
-    return _look_up(surface, x.astype(np.float32), y.astype(np.float32))
+    flat = len(x), math.prod(x.shape[1:])
+    x32, y32 = (np.asarray(v, np.float32).reshape(flat) for v in (x, y))
+    values, usable = _look_up([surface], np.zeros(len(x), np.intp), x32, y32)
+    return values.reshape(x.shape), usable.reshape(x.shape)
 
 
 def sample_patches(
-    surface: Surface, anchor: FloatArray, linear: FloatArray, offsets: FloatArray
+    surfaces: Sequence[Surface],
+    owner: IntArray,
+    anchor: FloatArray,
+    linear: FloatArray,
+    offsets: FloatArray,
 ) -> tuple[Float32Array, BoolArray]:
-    """Values on a small lattice around each of many anchors.
+    """Values on a small lattice around each of many anchors, each on a surface of its own.
 
     Parameters
     ----------
-    surface : Surface
+    surfaces : sequence of Surface
+        Windows of one raster.
+    owner : (P,) intp
+        Index of each anchor's surface; anchors of one surface are neighbours.
     anchor : (P, 2) float64
         Full-raster pixels, outer corner.
     linear : (P, 2, 2) float64
@@ -185,45 +198,67 @@ def sample_patches(
     -------
     As `sample`, (P, K).
     """
-    m = surface.to_window
-    origin = anchor @ m[:, :2].T + m[:, 2]
-    steps = np.matmul(m[:, :2], linear).astype(np.float32)
+    m = np.stack([surface.to_window for surface in surfaces])[owner]
+    origin = np.matmul(m[:, :, :2], anchor[:, :, None])[:, :, 0] + m[:, :, 2]
+    steps = np.matmul(m[:, :, :2], linear).astype(np.float32)
     grid = offsets.T.astype(np.float32)
     origin32 = origin.astype(np.float32)
     x = steps[:, 0, :] @ grid + origin32[:, 0, None]
     y = steps[:, 1, :] @ grid + origin32[:, 1, None]
-    return _look_up(surface, x, y)
+    return _look_up(surfaces, owner, x, y)
 
 
-def _look_up(surface: Surface, x: Float32Array, y: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Values and usability at outer-corner positions of the window."""
-    height, width = surface.coefficients.shape
+def _look_up(
+    surfaces: Sequence[Surface], owner: IntArray, x: Float32Array, y: Float32Array
+) -> tuple[Float32Array, BoolArray]:
+    """Values and usability at (P, K) outer-corner positions of each row's window."""
+    sides = np.array([surface.coefficients.shape for surface in surfaces], dtype=np.float32)
+    last = sides[owner] - 2
     x, y = corner_to_centre(x), corner_to_centre(y)
     with np.errstate(invalid="ignore"):
-        inside = (x >= 1) & (x <= width - 2) & (y >= 1) & (y <= height - 2)
+        inside = (x >= 1) & (x <= last[:, 1:]) & (y >= 1) & (y <= last[:, :1])
     if not inside.all():
         x, y = np.where(inside, x, np.float32(1)), np.where(inside, y, np.float32(1))
-    if not surface.usable.all():
-        inside &= surface.usable[np.rint(y).astype(np.intp), np.rint(x).astype(np.intp)]
-    return _evaluate(surface.coefficients, x, y), inside
+    ends = np.searchsorted(owner, np.arange(len(surfaces) + 1))
+    rows = [slice(start, end) for start, end in pairwise(ends.tolist())]
+    for surface, mine in zip(surfaces, rows, strict=True):
+        if not surface.usable.all():
+            at = np.rint(y[mine]).astype(np.intp), np.rint(x[mine]).astype(np.intp)
+            inside[mine] &= surface.usable[at]
+    return _evaluate([surface.coefficients for surface in surfaces], rows, x, y), inside
 
 
-def _evaluate(coefficients: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
+def _evaluate(
+    coefficients: list[Float32Array], rows: list[slice], x: Float32Array, y: Float32Array
+) -> Float32Array:
     x_low, x_high, x_share = _two_taps(x)
     y_low, y_high, y_share = _two_taps(y)
-    rows = []
+
+    def bilinear(at_x: Float32Array, at_y: Float32Array) -> Float32Array:
+        out = np.empty(at_x.shape, dtype=np.float32)
+        for image, mine in zip(coefficients, rows, strict=True):
+            if mine.start < mine.stop:
+                out[mine] = cv2.remap(
+                    image,
+                    at_x[mine],
+                    at_y[mine],
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+        return out
+
+    at_heights = []
     for at_y in (y_low, y_high):
-        left, right = (
-            np.asarray(
-                cv2.remap(
-                    coefficients, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-                ),
-                dtype=np.float32,
-            )
-            for at_x in (x_low, x_high)
-        )
-        rows.append(right + x_share * (left - right))
-    return np.asarray(rows[1] + y_share * (rows[0] - rows[1]), dtype=np.float32)
+        left, right = bilinear(x_low, at_y), bilinear(x_high, at_y)
+        left -= right
+        left *= x_share
+        left += right
+        at_heights.append(left)
+    low, high = at_heights
+    low -= high
+    low *= y_share
+    low += high
+    return low
 
 
 def _two_taps(at: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:

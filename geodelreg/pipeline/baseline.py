@@ -12,8 +12,8 @@ from geodelreg.fit.models import Frame, transformation
 from geodelreg.fit.select import Selection, held_out
 from geodelreg.geo.affine import affine_from_matrix, affine_matrix, apply_affine
 from geodelreg.image.stretch import to_uint8
-from geodelreg.match.consensus import log_nfa
 from geodelreg.match.keypoints import KeypointOptions, detect
+from geodelreg.match.surprise import log_nfa
 from geodelreg.match.zhang2013 import ZhangOptions, match_sift, match_zhang2013
 from geodelreg.pipeline.refinement import Refinement, refine_densely
 from geodelreg.pipeline.search import Hypothesis, WorkingPair, mean_band

@@ -15,7 +15,7 @@ from geodelreg.fit.models import Frame, Transformation
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan, single_band
 from geodelreg.match.consensus import consensus_affine, radial_residuals
-from geodelreg.match.refine import Refined, RefineOptions, cut_patches, refine
+from geodelreg.match.refine import Refined, RefineOptions, cut_patches, gather, refine
 from geodelreg.match.surface import Surface, high_pass, make_surface, sample
 from geodelreg.pipeline.tiles import Roles, Tile
 from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Status, StatusArray
@@ -26,8 +26,9 @@ DEFAULT_SIGMA = 0.5
 _SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
 _TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
-_SIGMA_PIXELS = 600_000
+_SIGMA_PIXELS = 300_000
 _MIXED_SIGMA = 0.03
+_GROUP_PATCHES = 100
 _CORE_SIGMAS = 1.5
 _CORE_FLOOR_PX = 0.03
 _SHIFT_SHARE = 0.15
@@ -207,22 +208,46 @@ def match_pass(
 ) -> Dense:
     """Match every patch of every tile once and fit an affine to those that agree."""
 
-    def one(tile: Tile) -> Refined | None:
-        bands, surface = tile_images(part, tile, tuning)
-        patches = cut_patches(bands, part.template.grid, options.size)
-        if options.every > 1:
-            patches = patches.take(slice(None, None, options.every))
+    def one(group: list[Tile]) -> Refined | None:
+        images = [tile_images(part, tile, tuning) for tile in group]
+        patches = gather(
+            [
+                cut_patches(bands, part.template.grid, options.size).take(every)
+                for bands, _ in images
+            ]
+        )
         if not len(patches):
             return None
-        return refine(patches, surface, lambda xy: part.to_surface(matrix, xy), options)
+        surfaces = [surface for _, surface in images]
+        return refine(patches, surfaces, lambda xy: part.to_surface(matrix, xy), options)
 
+    every = slice(None, None, options.every)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        parts = [r for r in pool.map(one, tiles) if r is not None]
+        groups = _grouped(tiles, options)
+        parts = [r for r in pool.map(one, groups) if r is not None]
     refined = _concatenate(parts)
     observations = _observe(part, refined, matrix)
     status = refined.status.copy()
     status[~np.isfinite(observations.covariance).all(axis=(1, 2))] = Status.TEXTURE
     return Dense(refined, observations, *agreement(part, observations, status, matrix))
+
+
+def _grouped(tiles: list[Tile], options: RefineOptions) -> Iterator[list[Tile]]:
+    """Neighbouring tiles that have enough patches together to be matched in one go.
+
+    Groups are the same for any number of threads, and so is what is found.
+    """
+    group: list[Tile] = []
+    count = 0
+    for tile in tiles:
+        height, width = tile.template[0].data.shape
+        group.append(tile)
+        count += (height // options.size) * (width // options.size) // options.every
+        if count >= _GROUP_PATCHES:
+            yield group
+            group, count = [], 0
+    if group:
+        yield group
 
 
 def agreement(

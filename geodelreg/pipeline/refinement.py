@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -19,7 +18,6 @@ from geodelreg.pipeline.dense import (
     match_pass,
 )
 from geodelreg.pipeline.search import Hypothesis, WorkingPair
-from geodelreg.pipeline.state import Pair
 from geodelreg.pipeline.tiles import (
     Roles,
     Tile,
@@ -85,11 +83,6 @@ class Refinement:
     without_bright: bool = False
 
 
-def thread_count(pair: Pair) -> int:
-    """Threads to use."""
-    return pair.options.threads or os.cpu_count() or 1
-
-
 def refine_densely(
     part: Roles, hypothesis: Hypothesis, timings: dict[str, float]
 ) -> Refinement | None:
@@ -99,7 +92,7 @@ def refine_densely(
     region = overlap_in_template(part, matrix)
     if region is None:
         return None
-    threads, size = thread_count(part.pair), patch_size(region.width * region.height)
+    threads, size = part.pair.threads, patch_size(region.width * region.height)
     tiles = read_tiles(part, plan_tiles(region, part.surface_px_per_template_px), matrix, threads)
     timings["read tiles"] = perf_counter() - start
     start = perf_counter()
@@ -144,7 +137,8 @@ def _of_the_ground(
     if not _agree(part, ground, everything):
         return replace(ground, without_bright=True)
     sigma = _difference(part, ground.dense, everything.dense)[1]
-    return ground if sigma[0] < _CLEARLY * sigma[1] else everything
+    more = _kept(ground) >= _kept(everything)
+    return ground if more or sigma[0] < _CLEARLY * sigma[1] else everything
 
 
 def _kept(one: Refinement) -> int:
@@ -206,14 +200,19 @@ def _passes(
     All but the last go over some of the tiles; with `or_header` they also start from the header,
     and the start that more patches agree with more closely is taken.
     """
-    threads = thread_count(part.pair)
+    threads = part.pair.threads
     some = tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
     starts = [matrix, IDENTITY] if or_header else [matrix]
     passes = _PASSES_FROM_AFAR if or_header else _PASSES
     near: Refinement | None = None
-    for where in [some, tiles] if some is not tiles else [tiles]:
-        found = [_approach(part, where, m, options, looks[0], passes) for m in starts]
-        near = min((one for one in found if one is not None), key=_scatter, default=None)
+    tries = [(look, where) for look in looks[:2] for where in (some, tiles)]
+    for look, where in tries if some is not tiles else tries[1::2]:
+        for start in starts:
+            found = _approach(part, where, start, options, look, passes)
+            if found is not None and (near is None or _scatter(found) < _scatter(near)):
+                near = found
+            if near is not None and _is_calm(near.dense):
+                break  # no other start could please more patches
         if near is not None:
             break
     if near is None:
@@ -238,11 +237,13 @@ def _approach(
     passes: int,
 ) -> Refinement | None:
     """Passes towards the transformation and the point spread, from a start a few pixels off."""
-    threads = thread_count(part.pair)
+    threads = part.pair.threads
+    local = look[1] and part.ms_is_template()
     sigma, near = DEFAULT_SIGMA, None
     for number in range(passes):
-        tuning = Tuning(sigma, fit_tone(part, tiles, matrix, sigma, threads, _FEWER_SAMPLES), *look)
-        if number == 1:
+        tone = fit_tone(part, tiles, matrix, sigma, threads, _FEWER_SAMPLES)
+        tuning = Tuning(sigma, tone, look[0], local)
+        if number == 1 and not local:  # only a common tone has a common sharpness
             sigma = fit_sigma(part, tiles, matrix, tuning, threads)
             tuning = replace(tuning, sigma=sigma)
         dense = match_pass(part, tiles, matrix, tuning, options, threads)
@@ -285,6 +286,9 @@ def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float) -> bool:
     if one.estimate is None or other.estimate is None:
         return one.estimate is not None
     kept = [int((dense.status == Status.KEPT).sum()) for dense in (one, other)]
+    models = [dense.estimate.transformation.model for dense in (one, other) if dense.estimate]
+    if models[0] != models[1]:  # a shift alone is more certain, but only few patches speak for it
+        return models[1] == "shift"
     sigma = _difference(part, one, other)[1]
     return kept[0] >= _SHARPER_SHARE * kept[1] and sigma[0] < factor * sigma[1]
 

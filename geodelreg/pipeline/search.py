@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from itertools import chain
 from time import perf_counter
 
 import numpy as np
@@ -20,7 +21,6 @@ from geodelreg.match.consensus import (
     Consensus,
     consensus_keypoints,
     fit_matrix,
-    log_nfa,
     radial_residuals,
 )
 from geodelreg.match.delaunay_filter import FilterOptions, filter_matches
@@ -32,12 +32,13 @@ from geodelreg.match.descriptors import (
     select,
 )
 from geodelreg.match.keypoints import KeypointOptions, detect, no_keypoints
+from geodelreg.match.surprise import log_nfa
 from geodelreg.pipeline.state import Pair
 from geodelreg.types import Band, BoolArray, FloatArray, Keypoints, Matches, Status, Window
 
 logger = logging.getLogger(__name__)
 
-FIRST_BUDGET_PX = 400_000
+FIRST_BUDGET_PX = 250_000
 SECOND_BUDGET_PX = 1_600_000
 WHOLE = "both rasters whole"
 FIRST_KEYPOINTS = 1500
@@ -51,6 +52,7 @@ _CALM_SHARE = 0.8
 _CHANCE_LOG_NFA = -2.0
 SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
+_TOGETHER_PX = 500_000  # a scale space takes some 230 bytes a pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,23 +184,26 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     Stops after the first way that is beyond doubt; a weak one is followed by those of other bands.
     """
     found: list[Hypothesis] = []
-    reference = _detect(images.reference, False, pair, images.scope)
+    views = _views(images.source)
+    first = next(views)
+    reference, keypoints = _detect_both(pair, images.scope, images.reference, first)
     bright = bright_mask(images.reference)
-
-    @cache
-    def dark_reference() -> Keypoints:
-        assert bright is not None
-        return _detect(_hidden(images.reference, bright), False, pair, images.scope)
-
-    for band in _views(images.source):
-        everywhere = _match_view(pair, images, band, reference)
+    dark: Keypoints | None = None
+    for band in chain([first], views):
+        everywhere = _match_view(pair, images, band, reference, keypoints)
+        keypoints = None
         mine = None if bright is None else bright_mask(band)
         if mine is None or bright is None:
             agreed = [] if everywhere is None else [everywhere]
         else:
             ground = None
             if everywhere is None or not _is_calm(everywhere):
-                ground = _match_view(pair, images, _hidden(band, mine), dark_reference())
+                hidden = _hidden(band, mine)
+                if dark is None:
+                    scene = _hidden(images.reference, bright)
+                    dark, keypoints = _detect_both(pair, images.scope, scene, hidden)
+                ground = _match_view(pair, images, hidden, dark, keypoints)
+                keypoints = None
             doubt = _in_doubt(pair, ground, everywhere)
             agreed = [replace(hypothesis, bright=(mine, bright)) for hypothesis in doubt]
         if any(hypothesis.log_nfa < SURE_LOG_NFA for hypothesis in agreed):
@@ -231,9 +236,14 @@ def _hidden(band: Band, mask: BoolArray) -> Band:
 
 
 def _match_view(
-    pair: Pair, images: WorkingPair, band: Band, reference: Keypoints
+    pair: Pair,
+    images: WorkingPair,
+    band: Band,
+    reference: Keypoints,
+    source: Keypoints | None = None,
 ) -> Hypothesis | None:
-    source = _detect(band, _mirrored(pair), pair, images.scope)
+    if source is None:
+        source = _detect(band, _mirrored(pair), pair, images.scope)
     matched = _one_to_one(pair, source, reference)
     if matched is None:
         return None
@@ -281,6 +291,20 @@ def _mirrored(pair: Pair) -> bool:
     """True when one header is south-up and the other is not: SIFT knows no mirror images."""
     turns = [r.grid.transform.determinant for r in (pair.source, pair.reference)]
     return turns[0] * turns[1] < 0
+
+
+def _detect_both(
+    pair: Pair, scope: Scope, reference: Band, source: Band
+) -> tuple[Keypoints, Keypoints | None]:
+    """Keypoints of two images, at once where their scale spaces are small."""
+    small = reference.data.size + source.data.size <= _TOGETHER_PX
+
+    def mine(image: Band, flip: bool) -> Keypoints:
+        return _detect(image, flip, pair, scope)
+
+    with ThreadPoolExecutor(2 if small and pair.threads > 1 else 1) as pool:
+        found = list(pool.map(mine, [reference, source], [False, _mirrored(pair)]))
+    return found[0], found[1]
 
 
 def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -13,10 +14,10 @@ from geodelreg.fit.models import IDENTITY, PARAMETER_COUNT, Transformation
 from geodelreg.fit.select import Selection, half_disagreement, select_model
 from geodelreg.geo.crs import linearise
 from geodelreg.match.area import Overlay, rival_correlation
-from geodelreg.match.consensus import log_nfa
 from geodelreg.match.delaunay_filter import star_filter
 from geodelreg.match.refine import RefineOptions
 from geodelreg.match.surface import make_surface
+from geodelreg.match.surprise import log_nfa
 from geodelreg.pipeline.accuracy import measure
 from geodelreg.pipeline.dense import Dense, surface_sigma
 from geodelreg.pipeline.evidence import (
@@ -32,7 +33,6 @@ from geodelreg.pipeline.refinement import (
     Refinement,
     dark_tile,
     refine_densely,
-    thread_count,
     working_tile,
 )
 from geodelreg.pipeline.search import Hypothesis
@@ -190,19 +190,25 @@ def conclude(
     start = perf_counter()
     pair, estimate = part.pair, fitted.selection.estimate
     matrix = estimate.transformation.matrix
-    before, after, wide = _overlays(part, hypothesis, refined, matrix)
-    accuracy = measure(part, fitted.points, fitted.selection, before, after)
-    area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=True)
-    if area.log_chance > _SURE_LOG_CHANCE:
-        area = area_evidence(part, refined.tiles, matrix, refined.tuning, refined.size, few=False)
-    apart = bands_apart(
-        part, refined.tiles, matrix, refined.tuning, refined.size, thread_count(pair)
-    )
-    evidence = replace(
-        _evidence(pair, fitted, accuracy, area),
-        rival=rival_correlation(wide),
-        bands_apart=apart,
-    )
+    threads = pair.threads
+
+    def overlaid() -> tuple[Accuracy, float]:
+        before, after, wide = _overlays(part, hypothesis, refined, matrix)
+        accuracy = measure(part, fitted.points, fitted.selection, before, after)
+        return accuracy, rival_correlation(wide)
+
+    # the tiles still hold the last pass's surfaces, which all of this shares
+    where = (part, refined.tiles, matrix, refined.tuning, refined.size)
+    with ThreadPoolExecutor(1) as aside:
+        whole = aside.submit(overlaid)
+        if threads == 1:
+            whole.result()
+        apart = bands_apart(*where, threads)
+        area = area_evidence(*where, few=True)
+        if area.log_chance > _SURE_LOG_CHANCE:
+            area = area_evidence(*where, few=False)
+        accuracy, rival = whole.result()
+    evidence = replace(_evidence(pair, fitted, accuracy, area), rival=rival, bands_apart=apart)
     grid = pair.lattice()
     move = pair.to_reference(matrix, grid) - pair.to_reference(IDENTITY, grid)
     sigma = estimate.sigma_at(grid) * pair.pan_px_per_source_px
@@ -257,8 +263,11 @@ def _overlays(
     sigma = surface_sigma(part, tile, COARSE_SIGMA)
     surface = make_surface(finer, part.surface.grid, sigma)
     wide = widened(part, template, finer, matrix)
-    before, after = (overlay(part, template, surface, m) for m in (IDENTITY, matrix))
-    return before, after, after if wide is template else overlay(part, wide, surface, matrix)
+    everything = overlay(part, wide, surface, matrix)
+    left, top = (round(v) for v in ~wide.grid.transform @ (template.grid.transform @ (0, 0)))
+    height, width = template.data.shape
+    after = everything.part(slice(top, top + height), slice(left, left + width))
+    return overlay(part, template, surface, IDENTITY), after, everything
 
 
 def _evidence(pair: Pair, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence) -> Evidence:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -64,6 +65,11 @@ class Pair:
     def pan_px_per_source_px(self) -> float:
         """GSD ratio: PAN pixels to one MS pixel."""
         return float(np.sqrt(self.source_area_ratio))
+
+    @property
+    def threads(self) -> int:
+        """Threads to use."""
+        return self.options.threads or os.cpu_count() or 1
 
     def frame(self) -> Frame:
         """Coordinates for fitting: the MS raster's centre, half its longer side, metric axes."""

@@ -89,7 +89,7 @@ def _metres_per_unit(source: Grid, at: FloatArray) -> FloatArray:
     """Metres that one map unit is long, along the x and the y axis, near a place of the map."""
     step = math.sqrt(abs(source.transform.determinant))
     pixel = Affine(step, 0.0, at[0] - step / 2, 0.0, -step, at[1] + step / 2)
-    return np.array(gsd_px_m(Grid(pixel, (1, 1), source.crs_wkt))) / step
+    return np.array(gsd_px_m(Grid(pixel, (1, 1), source.crs_wkt, source.unit_m))) / step
 
 
 def _decompose(before: FloatArray, after: FloatArray) -> tuple[float, tuple[float, float], float]:

@@ -122,22 +122,30 @@ def _rounded(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
-def versions() -> dict[str, str]:
-    """Versions of everything that can change a result."""
+def versions(*, with_proj: bool) -> dict[str, str]:
+    """Versions of everything that can change a result.
+
+    Parameters
+    ----------
+    with_proj : bool
+        That of pyproj and its PROJ, too: coordinates went through them.
+    """
     import platform
 
     import cv2
     import numpy
-    import pyproj
     import rasterio
 
-    return {
+    found = {
         "geodelreg": __version__,
         "python": platform.python_version(),
         "numpy": numpy.__version__,
         "opencv": cv2.__version__,
         "rasterio": rasterio.__version__,
         "gdal": rasterio.__gdal_version__,
-        "pyproj": pyproj.__version__,
-        "proj": pyproj.proj_version_str,
     }
+    if with_proj:
+        import pyproj
+
+        found |= {"pyproj": pyproj.__version__, "proj": pyproj.proj_version_str}
+    return found

@@ -58,6 +58,15 @@ def test_shift_is_in_pixels_of_the_overlay_however_large_it_is() -> None:
     assert best_shift(overlay(template, surface)) == pytest.approx((40, -30), abs=4)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_weak_agreement_of_much_outweighs_a_strong_one_of_little(seed: int) -> None:
+    """Small overlaps correlate by chance; those of changed ground hardly at all, but everywhere."""
+    ground, before, after = (texture(10 * seed + number, 200) for number in range(3))
+    template = cut(ground, 63, 58, (70, 70)) + 0.9 * cut(before, 0, 0, (70, 70))
+    surface = cut(ground, 60, 60, (70, 70)) + 0.9 * cut(after, 0, 0, (70, 70))
+    assert best_shift(overlay(template, surface)) == pytest.approx((3, -2), abs=1.5)
+
+
 def test_masked_pixels_do_not_pull_the_shift() -> None:
     """A no-data frame that lies at the same place in both images must not win."""
     ground = texture(2)

@@ -11,9 +11,9 @@ from geodelreg.match.consensus import (
     consensus_affine,
     consensus_keypoints,
     fit_matrix,
-    log_nfa,
     radial_residuals,
 )
+from geodelreg.match.surprise import log_nfa
 from geodelreg.types import FloatArray, IntArray, Keypoints, Matches
 
 SIZE_PX = 1000.0

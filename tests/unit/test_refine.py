@@ -78,7 +78,7 @@ def match(
     """Match from the place without displacement; the displacements, in template pixels."""
     full = Grid(Affine.identity(), image.shape, "")
     surface = make_surface(as_band(image, full), full, (0.0, 0.0))
-    found = refine(patches, surface, lambda xy: (xy + MARGIN) * ratio, options)
+    found = refine(patches, [surface], lambda xy: (xy + MARGIN) * ratio, options)
     assert len(found.status) == len(patches)
     return found, found.surface_px / ratio - MARGIN - found.template_px
 
@@ -131,7 +131,7 @@ def test_rotated_and_scaled_mapping_is_followed() -> None:
         u, v = turn @ (xy[..., 0] + 0.3, xy[..., 1] - 0.45)
         return np.stack([u, v], axis=-1) + offset
 
-    found = refine(patches_of(field.at(x / 1.7, y / 1.7)), surface, mapping, OPTIONS)
+    found = refine(patches_of(field.at(x / 1.7, y / 1.7)), [surface], mapping, OPTIONS)
     u, v = turn @ (found.template_px[:, 0], found.template_px[:, 1])
     assert (found.status == Status.KEPT).all()
     assert np.abs(found.surface_px - np.stack([u, v], axis=1) - offset).max() < 0.005 * 1.7

@@ -178,10 +178,33 @@ def test_patches_are_samples_around_anchors() -> None:
     anchor = rng.uniform(40, 50, (6, 2))
     linear = np.eye(2) * 1.7 + rng.normal(0, 0.2, (6, 2, 2))
     offsets = rng.uniform(-5, 5, (30, 2))
-    values, usable = sample_patches(surface, anchor, linear, offsets)
+    owner = np.zeros(6, dtype=np.intp)
+    values, usable = sample_patches([surface], owner, anchor, linear, offsets)
     expected, _ = sample(surface, anchor[:, None] + np.einsum("pij,kj->pki", linear, offsets))
     assert usable.all()
     assert values == pytest.approx(expected, abs=0.05)
+
+
+def test_patches_are_sampled_each_on_its_own_surface() -> None:
+    image = texture()
+    hidden = np.ones(SHAPE, dtype=bool)
+    hidden[40:44, 40:44] = False
+    surfaces = [
+        make_surface(band(image), FULL, (0.7, 0.7)),
+        make_surface(band(-image[:60, :80]), FULL, (0.7, 0.7)),
+        make_surface(band(image, valid=hidden), FULL, (0.7, 0.7)),
+    ]
+    rng = np.random.default_rng(4)
+    anchor = rng.uniform(20, 75, (40, 2))
+    owner = np.repeat([0, 1, 2], [15, 10, 15])
+    linear, offsets = np.broadcast_to(np.eye(2), (40, 2, 2)), rng.uniform(-3, 3, (9, 2))
+    values, usable = sample_patches(surfaces, owner, anchor, linear, offsets)
+    for number, surface in enumerate(surfaces):
+        mine = owner == number
+        alone = sample(surface, anchor[mine][:, None] + offsets)
+        assert values[mine] == pytest.approx(alone[0], abs=0.05)
+        assert (usable[mine] == alone[1]).mean() > 0.99
+    assert 0 < usable[owner == 1].mean() < 1
 
 
 def test_high_pass_leaves_the_mean_and_masked_values_out() -> None:
