@@ -139,6 +139,10 @@ def own_command(scene: Path, out: Path) -> list[str]:
 
 
 def own_environment() -> dict[str, str]:
-    """Environment variables under which this checkout's geodelreg is found."""
+    """Environment variables under which this checkout's geodelreg is found.
+
+    Its byte code is kept, as pip keeps that of an installed copy and of every peer.
+    """
     paths = os.pathsep.join([str(ROOT), str(ROOT / "cli")])
-    return {**os.environ, "PYTHONPATH": paths}
+    rest = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    return {**rest, "PYTHONPATH": paths}

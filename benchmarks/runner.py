@@ -173,7 +173,9 @@ def available_tools(cache: Path, only: set[str]) -> Iterator[Tool]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks peers``."""
     parser.add_argument("--scenes", type=Path, required=True, help="folder that `scenes` wrote")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file for the results")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="JSON file for the results; a run continues it"
+    )
     parser.add_argument("--only", default="", help="scenes, comma-separated")
     parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
     parser.add_argument("--quick", action="store_true", help="scenes A, C and G only")
@@ -188,12 +190,16 @@ def run(args: argparse.Namespace) -> int:
     tools = list(available_tools(args.envs, {name for name in args.peers.split(",") if name}))
     wanted = {name for name in args.only.split(",") if name}
     wanted = wanted or (set(QUICK_SCENES) if args.quick else set())
-    results: list[Result] = []
-    host = machine()
+    host, results = machine(), []
+    if args.out.exists():
+        results = [Result(**row) for row in json.loads(args.out.read_text())["results"]]
+    done = {(result.scene, result.tool, result.setting) for result in results}
     for scene in sorted(path.parent for path in args.scenes.glob("*/truth.json")):
         if wanted and scene.name not in wanted:
             continue
         for tool in tools:
+            if (Truth.load(scene / "truth.json").name, tool.name, tool.setting) in done:
+                continue
             runs = [run_tool(tool, scene, args.timeout) for _ in range(args.repeat)]
             best = min(runs, key=lambda result: result.wall_s)
             results.append(best)
@@ -203,9 +209,9 @@ def run(args: argparse.Namespace) -> int:
                 f"{best.failure}",
                 flush=True,
             )
-        args.out.write_text(
-            json.dumps({"machine": host, "results": [asdict(r) for r in results]}, indent=2)
-        )
+            args.out.write_text(
+                json.dumps({"machine": host, "results": [asdict(r) for r in results]}, indent=2)
+            )
     if args.docs:
         from benchmarks.peer_table import write_page
 
