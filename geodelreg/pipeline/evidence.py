@@ -24,6 +24,7 @@ _DISPLACED_RADII = (4.0, 9.0)
 _DIRECTIONS = 8
 _BY_CHANCE = 0.125
 _TESTED_PATCHES = 160
+_BAND_PATCHES = 100
 _LEAST_SEEN = 0.6
 _LEAST_DISPLACED = 8
 _RESEMBLES = 0.25
@@ -95,7 +96,7 @@ def area_evidence(
     angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
-    every = _sample_step(tiles, size) if few else 1
+    every = _sample_step(tiles, size, _TESTED_PATCHES) if few else 1
     found = AreaEvidence()
     for number, tile in enumerate(tiles):
         bands, surface = tile_images(part, tile, tuning)
@@ -106,11 +107,11 @@ def area_evidence(
     return found
 
 
-def _sample_step(tiles: list[Tile], size: int) -> int:
-    """Every which patch to look at, so that `_TESTED_PATCHES` or a few more are."""
+def _sample_step(tiles: list[Tile], size: int, wanted: int) -> int:
+    """Every which patch to look at, so that the wanted number or a few more are."""
     shapes = [tile.template[0].data.shape for tile in tiles]
     count = int(sum((height // size) * (width // size) for height, width in shapes))
-    return max(count // _TESTED_PATCHES, 1)
+    return max(count // wanted, 1)
 
 
 def best_in_place(scores: FloatArray) -> AreaEvidence:
@@ -156,7 +157,9 @@ def bands_apart(
     centre = np.array([[width / 2, height / 2]])
     count = len(pair.source_bands)
     some = tiles[:: max(len(tiles) // _BAND_TILES, 1)]
-    options = RefineOptions(size=size, tolerance=ROUGH_STEP, every=_sample_step(some, size))
+    options = RefineOptions(
+        size=size, tolerance=ROUGH_STEP, every=_sample_step(some, size, _BAND_PATCHES)
+    )
 
     def by_itself(band: int) -> Dense:
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
