@@ -110,12 +110,14 @@ def revert(path: Path) -> None:
                 f"{path} has no record of an edit in place",
                 f"The record would be {undo.record_path(raster).name} in the same folder.",
             )
+        following = [*edits[1:], None]
+        states = [one.state(raster, file, two) for one, two in zip(edits, following, strict=True)]
+        if State.FOREIGN in states:
+            raise UnsafeInPlaceError(
+                f"{path} was changed by another program after its header was edited",
+                "Taking the edit back would lose those changes; use a backup.",
+            )
         while edits:
-            if edits[-1].state(raster, file) is State.FOREIGN:
-                raise UnsafeInPlaceError(
-                    f"{path} was changed by another program after its header was edited",
-                    "Taking the edit back would lose those changes; use a backup.",
-                )
             edits[-1].undo(raster, file)
             edits.pop()
             undo.save(raster, edits)

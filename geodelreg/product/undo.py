@@ -67,12 +67,23 @@ class Edit:
     tail: bytes
     sidecars: tuple[SidecarChange, ...] = ()
 
-    def state(self, raster: Path, file: BinaryIO) -> State:
-        """Compare the file with what it was and what it should become."""
+    def state(self, raster: Path, file: BinaryIO, later: Edit | None = None) -> State:
+        """Compare the file with what it was and what it should become.
+
+        Parameters
+        ----------
+        raster : Path
+        file : binary file
+        later : Edit, optional
+            The next edit on record: the file is seen as it will be without that one.
+        """
+        end = os.fstat(file.fileno()).st_size
         pointer = _read(file, self.pointer_at, len(self.old_pointer))
-        added = _read(file, self.size, len(self.tail) + 1)
-        if os.fstat(file.fileno()).st_size < self.size:
+        if later is not None:
+            end, pointer = min(end, later.size), later.old_pointer
+        if end < self.size:
             return State.FOREIGN
+        added = _read(file, self.size, min(len(self.tail) + 1, end - self.size))
         if pointer == self.new_pointer and added == self.tail:
             waiting = any(
                 _content(raster, change.name) == change.before for change in self.sidecars

@@ -246,6 +246,39 @@ def test_revert_refuses_without_a_record_and_after_foreign_changes(tmp_path: Pat
     assert raster.read_bytes() == before["ms.tif"]
 
 
+def test_revert_decides_before_it_takes_anything_back(tmp_path: Path) -> None:
+    raster = make_tiff(tmp_path / "ms.tif")
+    size = raster.stat().st_size
+    edit(raster)
+    edit(raster, ROTATION)
+    edit(raster)
+    content = bytearray(raster.read_bytes())
+    content[size + 20] ^= 1  # within what the first edit has appended
+    raster.write_bytes(content)
+    before = contents(tmp_path)
+    with pytest.raises(UnsafeInPlaceError, match="changed by another program"):
+        revert(raster)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("done", ["recorded", "begun", "appended", "complete"])
+def test_revert_takes_back_an_edit_that_was_interrupted_after_others(
+    tmp_path: Path, done: str
+) -> None:
+    raster = make_tiff(tmp_path / "ms.tif")
+    original = raster.read_bytes()
+    edit(raster)
+    between = raster.read_bytes()
+    edit(raster, ROTATION)
+    after = raster.read_bytes()
+    appended = between + after[len(between) :]
+    stages = {"recorded": between, "begun": appended[: len(between) + 7], "appended": appended}
+    raster.write_bytes(stages.get(done, after))
+    revert(raster)
+    assert raster.read_bytes() == original
+    assert names(tmp_path) == {"ms.tif"}
+
+
 @pytest.mark.parametrize(
     "damage",
     [
