@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -20,7 +21,7 @@ from rasterio.rio.main import main_group
 from rasterio.transform import from_gcps
 
 from geodelreg.errors import GcpFormatError, RasterUnreadableError
-from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
+from geodelreg.product.gcps import GCP_FORMATS, GcpContext, read_gcps, write_gcps
 from geodelreg.types import Gcp, Grid
 from tests.data.gcps import make
 
@@ -242,3 +243,35 @@ def test_every_file_reads_back(folder: Path, name: str) -> None:
     found, _ = read_gcps(folder / name, context=make.context(folder))
     for one, other in zip(values(found), values(make.points()), strict=True):
         assert one == pytest.approx(other, abs=1e-8)
+
+
+@pytest.mark.parametrize("end", [".points", ".gcp", ".csv", ".geojson", ".vrt", ".pts", ".txt"])
+def test_a_file_too_large_for_points_is_not_read(tmp_path: Path, end: str) -> None:
+    path = tmp_path / f"huge{end}"
+    path.touch()
+    os.truncate(path, 10**12)
+    code = (
+        "import resource, sys\n"
+        "from geodelreg.errors import GcpFormatError\n"
+        "from geodelreg.product.gcps import read_gcps\n"
+        "try:\n    read_gcps(sys.argv[1])\n"
+        "except GcpFormatError as error:\n    print(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    message, peak_kb = done.stdout.splitlines()
+    assert message.startswith(f"{path} is too large for a file of control points")
+    assert "more than 50 MB" in message
+    assert "Check that it is the right file" in message
+    assert int(peak_kb) < 400_000
+
+
+@pytest.mark.parametrize("name", GCP_FORMATS)
+def test_as_many_points_as_can_be_asked_for_are_not_too_large(folder: Path, name: str) -> None:
+    row = (12345.123456789123, 12345.678912345678, 500_000.123456789, 4_000_000.123456789)
+    info = "residual -0.1234 -0.2345 px; sigma 0.1234 0.2345 px"
+    gcps = [Gcp(str(100_000 + number), *row, info=info) for number in range(1000)]
+    context = replace(make.context(folder), reference_px=None)
+    write_gcps(folder / "many.dat", gcps, name, context=context)
+    # of --max-keypoints 100000
+    assert 100 * (folder / "many.dat").stat().st_size < 50_000_000

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,6 +37,9 @@ __all__ = [
     "read_gcps",
     "write_gcps",
 ]
+
+_LARGEST_BYTES = 50_000_000
+"""Of a file, 100 000 points in the wordiest format; its parsers take 25 times as much memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,16 +178,12 @@ def read_gcps(
     Raises
     ------
     GcpFormatError
-        If the file cannot be read as that format; the message names file and line.
+        If the file cannot be read as that format; the message names file and line.  Files of
+        more than 50 MB are not read.
     """
     source = Path(path)
     name = format or _format_by_extension(source)
-    try:
-        text = source.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise GcpFormatError(
-            f"{source} cannot be read ({error})", "Check the path; the text must be UTF-8."
-        ) from error
+    text = _text(source)
     if format is None and name == "envi" and envi.is_image_to_map(text):
         name = "envi-map"
     try:
@@ -191,6 +191,24 @@ def read_gcps(
     except GcpFormatError as error:
         remedy = error.remedy or f"Correct the file, or name its format; {name} was read."
         raise GcpFormatError(f"{source}: {error.cause}", remedy) from error
+
+
+def _text(source: Path) -> str:
+    """Content of a file of bearable size."""
+    try:
+        with source.open("rb") as file:
+            data = file.read(_LARGEST_BYTES + 1)
+        if len(data) > _LARGEST_BYTES:
+            raise GcpFormatError(
+                f"{source} is too large for a file of control points, it has more than "
+                f"{_LARGEST_BYTES // 1_000_000} MB",
+                "Check that it is the right file, or split it into several.",
+            )
+        return io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig").read()
+    except (OSError, UnicodeDecodeError) as error:
+        raise GcpFormatError(
+            f"{source} cannot be read ({error})", "Check the path; the text must be UTF-8."
+        ) from error
 
 
 def _format(name: str) -> GcpFormat:
