@@ -18,6 +18,7 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
 )
+from geodelreg.fatal import check_survivable, contradiction
 from geodelreg.image.access import LOCAL, check_name, drivers
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.paths import is_local
@@ -87,6 +88,7 @@ def _check_before_opening(path: str, allow: str) -> int | None:
     if not file.exists():
         raise RasterNotFoundError(f"{path} does not exist", "Check the path.")
     check_regular(file)
+    check_survivable(file)
     return check_vrt_sources(file, allow) if is_vrt(file) else file.stat().st_size
 
 
@@ -118,6 +120,10 @@ def _check_pixels(path: str, dataset: DatasetReader) -> None:
         )
     if dataset.count == 0 or dataset.width < 1 or dataset.height < 1:
         raise RasterUnreadableError(f"{path} holds no pixels", "Give a raster with image bands.")
+    with gdal_calls():
+        is_ycbcr = dataset.tags(ns="IMAGE_STRUCTURE").get("COMPRESSION") == "YCbCr JPEG"
+    if is_ycbcr and dataset.driver == "GTiff" and dataset.count != 3:
+        raise contradiction(path, dataset.count)  # `check_survivable` sees local files only
     for number, dtype in enumerate(dataset.dtypes, start=1):
         if dtype.startswith("complex"):
             raise RasterUnreadableError(

@@ -14,6 +14,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from geodelreg.errors import RasterNotFoundError, RasterUnreadableError
+from geodelreg.fatal import check_survivable
 from geodelreg.image.access import ALL, LOCAL, check_name, drivers, refuse
 from geodelreg.image.paths import is_local
 
@@ -116,6 +117,7 @@ class _Look:
         if item.raw and self.allow != ALL and not _is_below(source, vrt.parent):
             raise refuse(f"{vrt} reads the bytes of {source}, which is not in its folder", ALL)
         check_regular(source)
+        check_survivable(source)
         self.stored_bytes += source.stat().st_size
         if is_vrt(source):
             self.at(source, parents)

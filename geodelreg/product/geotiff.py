@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from geodelreg.errors import RasterUnreadableError, UsageError
+from geodelreg.fatal import check_survivable
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.atomic import check_not_input, staged
@@ -96,6 +97,7 @@ def check_source(source: Path) -> None:
 
     if not str(source).startswith("/vsi"):
         open_source(source).close()
+        check_survivable(source)
     try:
         rasterio.open(source).close()
     except gdal_failures() as error:
