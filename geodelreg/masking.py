@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePath
 
 from geodelreg.errors import UsageError
 
@@ -16,6 +18,15 @@ AUTO, BINARY, LANDSAT_QA, SENTINEL2_SCL = MASK_KINDS = (
 VECTOR, VALUES = "vector", "values"
 
 _RANGE = re.compile(r"(-?\d+)(?:-(\d+))?")
+
+
+def _word(pattern: str) -> re.Pattern[str]:
+    return re.compile(rf"(?:^|[^A-Z0-9])(?:{pattern})(?:$|[^A-Z0-9])", re.IGNORECASE)
+
+
+_NAMES = {LANDSAT_QA: _word("QA_PIXEL"), SENTINEL2_SCL: _word("SCL")}
+_OLD_LANDSAT = _word("BQA|PIXEL_QA")
+_OTHER_FLAGS = _word("QA_RADSAT|QA_AEROSOL|QA60")
 
 Ranges = tuple[tuple[int, int], ...]
 
@@ -104,3 +115,39 @@ class MaskUse:
     hide: Ranges = ()
     hidden_share: float = float("nan")
     covered_share: float = 1.0
+
+
+def quality_kind(name: str) -> str | None:
+    """Kind of quality band that a file name (without folders) or a band's description tells of."""
+    return next((kind for kind, pattern in _NAMES.items() if pattern.search(name)), None)
+
+
+def is_old_landsat(name: str) -> bool:
+    """Whether a file or band name is that of a quality band before Collection 2."""
+    return _OLD_LANDSAT.search(name) is not None
+
+
+def quality_bands(path: str, descriptions: Sequence[str | None]) -> dict[int, str]:
+    """Numbers (from 1) and kinds of the bands of a raster that are quality bands.
+
+    A band's description says so, or the file's name when there is but one band.
+    """
+    kinds = {n: quality_kind(text or "") for n, text in enumerate(descriptions, start=1)}
+    if len(descriptions) == 1 and kinds[1] is None:
+        kinds[1] = quality_kind(PurePath(path).stem)
+    return {number: kind for number, kind in kinds.items() if kind is not None}
+
+
+def flag_bands(path: str, descriptions: Sequence[str | None]) -> tuple[int, ...]:
+    """Numbers (from 1) of the bands whose values are classes or bits, which have no average.
+
+    Quality bands, those of which geodelreg makes no masks included; known by the same names.
+    """
+
+    def is_one(name: str) -> bool:
+        return bool(quality_kind(name) or is_old_landsat(name) or _OTHER_FLAGS.search(name))
+
+    texts = [text or "" for text in descriptions]
+    if len(texts) == 1 and not is_one(texts[0]):
+        texts = [PurePath(path).stem]
+    return tuple(number for number, text in enumerate(texts, start=1) if is_one(text))

@@ -166,7 +166,11 @@ class WriteOptions:
     warp_grid: str = _knob(
         "ms", "Grid of --warp: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
     )
-    resampling: str = _knob("cubic", "Resampling of --warp.", RESAMPLINGS)
+    resampling: str = _knob(
+        "cubic",
+        "Resampling of --warp; quality bands (as QA_PIXEL, SCL) and colour tables keep to nearest.",
+        RESAMPLINGS,
+    )
 
     def __post_init__(self) -> None:
         _check_choice(self, "georef")

@@ -25,14 +25,18 @@ from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.opening import dataset_grid, open_dataset
-from geodelreg.image.quality import (
-    hidden_values,
-    impossible_values,
+from geodelreg.image.quality import hidden_values, impossible_values
+from geodelreg.image.validity import alpha_bands
+from geodelreg.masking import (
+    AUTO,
+    BINARY,
+    LANDSAT_QA,
+    MASK_KINDS,
+    SENTINEL2_SCL,
+    MaskSpec,
     is_old_landsat,
     quality_bands,
 )
-from geodelreg.image.validity import alpha_bands
-from geodelreg.masking import AUTO, BINARY, LANDSAT_QA, MASK_KINDS, SENTINEL2_SCL, MaskSpec
 from geodelreg.types import BoolArray, FloatArray, Grid, IntArray, Window
 
 _TOUCH_PX = 1e-3

@@ -1,4 +1,4 @@
-"""Quality bands: what the values of a mask mean, and bands that are one by their name.
+"""Quality bands: what their values, and those of other masks, mean.
 
 Landsat Collection 2 ``QA_PIXEL`` (USGS LSDS-1619, table 6-2) has a bit for each finding and two
 bits for the confidence in some of them; the pattern 10 is used for clouds only.  Sentinel-2 ``SCL``
@@ -10,8 +10,6 @@ that lies still between the two images; where they show nothing nothing is match
 
 from __future__ import annotations
 
-import re
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,6 @@ from numpy.typing import NDArray
 from geodelreg.masking import BINARY, LANDSAT_QA, SENTINEL2_SCL, VALUES, Ranges
 from geodelreg.types import BoolArray
 
-
-def _word(pattern: str) -> re.Pattern[str]:
-    return re.compile(rf"(?:^|[^A-Z0-9])(?:{pattern})(?:$|[^A-Z0-9])", re.IGNORECASE)
-
-
-_NAMES = {LANDSAT_QA: _word("QA_PIXEL"), SENTINEL2_SCL: _word("SCL")}
-_OLD_LANDSAT = _word("BQA|PIXEL_QA")
-
 # fill, dilated cloud, cirrus, cloud, cloud shadow
 _LANDSAT_HIDDEN = 0b11111
 _FILL, _CIRRUS, _CLOUD, _SHADOW, _SNOW = (1 << bit for bit in (0, 2, 3, 4, 5))
@@ -35,27 +25,6 @@ _MSS_BITS = _FILL | _CLOUD | 3 << 8
 # no data, saturated or defective, cloud shadow, cloud (medium and high probability), thin cirrus
 _SCL_HIDDEN = (0, 1, 3, 8, 9, 10)
 _SCL_LAST = 11
-
-
-def quality_kind(name: str) -> str | None:
-    """Kind of quality band that a file name (without folders) or a band's description tells of."""
-    return next((kind for kind, pattern in _NAMES.items() if pattern.search(name)), None)
-
-
-def is_old_landsat(name: str) -> bool:
-    """Whether a file or band name is that of a quality band before Collection 2."""
-    return _OLD_LANDSAT.search(name) is not None
-
-
-def quality_bands(path: str, descriptions: tuple[str | None, ...]) -> dict[int, str]:
-    """Numbers (from 1) and kinds of the bands of a raster that are quality bands.
-
-    A band's description says so, or the file's name when there is but one band.
-    """
-    kinds = {n: quality_kind(text or "") for n, text in enumerate(descriptions, start=1)}
-    if len(descriptions) == 1 and kinds[1] is None:
-        kinds[1] = quality_kind(PurePath(path).stem)
-    return {number: kind for number, kind in kinds.items() if kind is not None}
 
 
 def hidden_values(

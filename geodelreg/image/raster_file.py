@@ -24,8 +24,8 @@ from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_throug
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
 from geodelreg.image.paths import is_local
-from geodelreg.image.quality import quality_bands
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
+from geodelreg.masking import quality_bands
 from geodelreg.types import BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:

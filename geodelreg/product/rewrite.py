@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.environment import gdal_failures
@@ -146,6 +147,7 @@ def _tiff_creation(
     user = user_creation(options)
     creation = {"BIGTIFF": "IF_SAFER"}
     with rasterio.open(source) as dataset:
+        names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
         structure = metadata.tags(dataset, 0, "IMAGE_STRUCTURE")
         has_overviews = bool(dataset.overviews(1))
         inherited = dataset.driver in _TIFF_DRIVERS and is_tiff(source)
@@ -161,6 +163,8 @@ def _tiff_creation(
                 creation["BLOCKXSIZE"] = str(blocks[1])
         elif tiled and blocks[0] == blocks[1]:
             creation["BLOCKSIZE"] = str(blocks[0])
+    if driver == "COG" and "RESAMPLING" not in user and flag_bands(source.name, names):
+        creation["OVERVIEW_RESAMPLING"] = "NEAREST"  # of those that GDAL adds
     if has_overviews and driver == "GTiff":
         creation["COPY_SRC_OVERVIEWS"] = "YES"
     if user.get("TILED", creation.get("TILED", "")).upper() != creation.get("TILED"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from affine import Affine
 
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
+from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.atomic import check_not_input, staged
@@ -71,7 +72,8 @@ def write_warped(
     """Resample the corrected source raster north-up through GDAL's warper.
 
     Pixels that the source does not cover get its no-data value, or zero alpha, or are masked;
-    float rasters that have none of these get NaN.
+    float rasters that have none of these get NaN.  Colour tables and quality bands are resampled by
+    nearest neighbour, whatever is asked for.
 
     Parameters
     ----------
@@ -108,7 +110,9 @@ def write_warped(
             creation = user_creation(options) if driver == "GTiff" else {}
             draft = out
             if driver != "GTiff":
-                draft = out.parent.parent / "warped" / "warped.tif"
+                draft = (
+                    out.parent.parent / "warped" / f"{source.stem}.tif"
+                )  # which may tell of flags
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
                 notes = _warp(source, draft, content, grid, creation, options)
@@ -194,7 +198,7 @@ def _warp(
 
     notes: list[str] = []
     with corrected_view(source, content, mask_rules=True) as (name, _), rasterio.open(name) as view:
-        resampling = _resampling(view, options, notes)
+        resampling, flags = _resampling(source, view, options, notes)
         validity = _Validity.of(view)
         if len({repr(value) for value in view.nodatavals}) > 1:
             notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
@@ -202,22 +206,36 @@ def _warp(
         profile |= {key.lower(): value for key, value in creation.items()}
         with (
             _warped(view, grid, validity, resampling) as warped,
+            _warped(view, grid, validity, "nearest") as nearest,
             rasterio.open(out, "w", **profile) as dataset,
         ):
             _annotate(view, dataset)
-            _copy_pixels(warped, dataset, validity)
-    _copy_overviews(source, out, "nearest" if resampling == "nearest" else "average")
+            _copy_pixels(warped, nearest, flags, dataset, validity)
+    _copy_overviews(source, out, "nearest" if flags or resampling == "nearest" else "average")
     compare.check_decodable(out)
     return notes
 
 
-def _resampling(view: Any, options: WriteOptions, notes: list[str]) -> str:
+def _resampling(
+    source: Path, view: Any, options: WriteOptions, notes: list[str]
+) -> tuple[str, tuple[int, ...]]:
+    """Resampling of the bands, and numbers of those that are resampled by nearest neighbour."""
     from rasterio.enums import ColorInterp
 
-    if ColorInterp.palette in view.colorinterp and options.resampling != "nearest":
+    if options.resampling == "nearest":
+        return "nearest", ()
+    if ColorInterp.palette in view.colorinterp:
         notes.append("values of a colour table cannot be averaged; resampled by nearest neighbour")
-        return "nearest"
-    return options.resampling
+        return "nearest", ()
+    names = metadata.attribute(view, "descriptions") or (None,) * view.count
+    flags = flag_bands(source.name, names)
+    if flags:
+        which = " and ".join(f"{n} ({names[n - 1]})" if names[n - 1] else str(n) for n in flags)
+        notes.append(
+            f"{source.name}: flags in band{'s' * (len(flags) > 1)} {which} cannot be averaged; "
+            "these bands, and all overviews, are resampled by nearest neighbour"
+        )
+    return options.resampling, flags
 
 
 def _profile(view: Any, grid: Grid, validity: _Validity) -> dict[str, Any]:
@@ -299,9 +317,13 @@ def _copy_colormaps(view: Any, dataset: Any) -> None:
             dataset.write_colormap(band, colormap)
 
 
-def _copy_pixels(warped: Any, dataset: Any, validity: _Validity) -> None:
+def _copy_pixels(
+    warped: Any, nearest: Any, flags: Sequence[int], dataset: Any, validity: _Validity
+) -> None:
     for window in compare.windows_of(dataset):
         data = warped.read(window=window)
+        if flags:
+            data[[number - 1 for number in flags]] = nearest.read(list(flags), window=window)
         dataset.write(data[: dataset.count], window=window)
         if validity.is_mask:
             dataset.write_mask(data[-1] != 0, window=window)

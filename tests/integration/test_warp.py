@@ -20,10 +20,12 @@ from geodelreg.errors import (
     UnsupportedGeoreferenceError,
 )
 from geodelreg.options import WriteOptions
+from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.warp import north_up_grid, write_warped
 from geodelreg.types import Correction, Grid
 from tests.integration.faults import names
 from tests.integration.raster_samples import (
+    GCPS,
     ROTATION,
     TAGS,
     TRANSFORM,
@@ -227,6 +229,105 @@ def test_colour_table_is_resampled_by_nearest_neighbour(tmp_path: Path) -> None:
     with rasterio.open(out) as dataset:
         assert set(np.unique(dataset.read(1))) == {0, 200}
         assert dataset.colormap(1)[200] == (9, 8, 7, 255)
+
+
+FLAGS = np.array([1, 21824, 21888, 22080, 22280, 23826, 23888, 30048, 54596], dtype=np.uint16)
+"""Of Landsat's QA_PIXEL: fill, clear, water, clouds, shadow, snow, cirrus."""
+
+
+def write_flags(
+    path: Path,
+    names: tuple[str | None, ...],
+    overviews: bool = True,
+    repeats: int = 4,
+    **profile: Any,
+) -> Path:
+    """Raster of flags, in which the bands called B2 are images."""
+    height, width = 30 * repeats, 38 * repeats
+    settings = {"driver": "GTiff", "height": height, "width": width, "count": len(names)}
+    settings |= {"dtype": "uint16", "crs": UTM18, "transform": TRANSFORM, **profile}
+    random = np.random.default_rng(4)
+    with rasterio.open(path, "w", **settings) as dataset:
+        for band, name in enumerate(names, start=1):
+            data = random.choice(FLAGS, (30, 38)).repeat(repeats, axis=0).repeat(repeats, axis=1)
+            if name and "B2" in name:
+                data = texture((1, height, width), "uint16")[0]
+            dataset.write(data, band)
+            dataset.set_band_description(band, name or "")
+        if overviews:
+            dataset.build_overviews([2, 4], rasterio.enums.Resampling.nearest)
+    return path
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+@pytest.mark.parametrize("resampling", ["bilinear", "cubic", "lanczos", "average"])
+@pytest.mark.parametrize("nodata", [None, 0])
+def test_flags_are_never_averaged(
+    tmp_path: Path, nodata: int | None, resampling: str, driver: str
+) -> None:
+    names = ("B2", "QA_PIXEL", "B2 again", "SCL")
+    source = write_flags(tmp_path / "ms.tif", names, nodata=nodata)
+    out, plain = tmp_path / "out.tif", tmp_path / "plain.tif"
+    correction = correction_of(source, ROTATION)
+    options = WriteOptions(warp=True, resampling=resampling, driver=driver)
+    warnings = write_warped(source, out, correction, UNUSED, TAGS, options)
+    assert len(warnings) == 1
+    assert "bands 2 (QA_PIXEL) and 4 (SCL)" in warnings[0]
+    assert "nearest" in warnings[0]
+    for level in (None, 0, 1):
+        opened = {} if level is None else {"OVERVIEW_LEVEL": level}
+        with rasterio.open(out, **opened) as dataset:
+            for band in (2, 4):
+                assert set(np.unique(dataset.read(band))) <= {0, *FLAGS.tolist()}
+    columns, rows = source_positions(out, correction.corrected)
+    inner = (columns > 1) & (columns < 151) & (rows > 1) & (rows < 119)
+    # a pixel's centre that lies near its edge may belong to the next
+    clear = inner & (np.abs(columns % 1 - 0.5) < 0.49) & (np.abs(rows % 1 - 0.5) < 0.49)
+    with rasterio.open(source) as before, rasterio.open(out) as after:
+        for band in (2, 4):
+            there = before.read(band)[rows[clear].astype(int), columns[clear].astype(int)]
+            assert np.array_equal(after.read(band)[clear], there)
+        images = after.read([1, 3])
+    with rasterio.open(source, "r+") as dataset:
+        for band in (2, 4):
+            dataset.set_band_description(band, "")
+    assert write_warped(source, plain, correction, UNUSED, TAGS, options) == []
+    with rasterio.open(plain) as dataset:
+        assert np.array_equal(dataset.read([1, 3]), images)  # the images are resampled as ever
+        assert not set(np.unique(dataset.read(2))) <= {0, *FLAGS.tolist()}
+
+
+def test_quality_band_in_a_file_of_its_own_is_resampled_by_nearest_neighbour(
+    tmp_path: Path,
+) -> None:
+    source = write_flags(tmp_path / "LC08_L2SP_T1_QA_PIXEL.TIF", (None,))
+    for driver in ("GTiff", "COG"):
+        out = tmp_path / f"{driver}.tif"
+        options = WriteOptions(warp=True, driver=driver)
+        warnings = write_warped(source, out, correction_of(source, ROTATION), UNUSED, TAGS, options)
+        assert "nearest" in warnings[0]
+        for level in (-1, 0, 1):
+            with rasterio.open(out, **({} if level < 0 else {"OVERVIEW_LEVEL": level})) as dataset:
+                assert set(np.unique(dataset.read(1))) <= {0, *FLAGS.tolist()}
+
+
+def test_overviews_that_a_cog_adds_hold_flags_of_the_file(tmp_path: Path) -> None:
+    source = write_flags(tmp_path / "ms.tif", ("B2", "QA_PIXEL"), overviews=False, repeats=20)
+    for warp in (True, False):
+        out, options = tmp_path / f"{warp}.tif", WriteOptions(warp=warp, driver="COG")
+        if warp:
+            write_warped(source, out, correction_of(source, ROTATION), UNUSED, TAGS, options)
+        else:
+            write_corrected(source, out, correction_of(source), GCPS, TAGS, options)
+        with rasterio.open(out, OVERVIEW_LEVEL=0) as dataset:
+            assert set(np.unique(dataset.read(2))) <= {0, *FLAGS.tolist()}
+
+
+def test_flags_asked_for_by_nearest_neighbour_need_no_warning(tmp_path: Path) -> None:
+    source = write_flags(tmp_path / "ms.tif", ("B2", "QA_PIXEL"))
+    options = WriteOptions(warp=True, resampling="nearest")
+    correction = correction_of(source, ROTATION)
+    assert write_warped(source, tmp_path / "out.tif", correction, UNUSED, TAGS, options) == []
 
 
 def test_pixel_is_point_is_placed_right(tmp_path: Path) -> None:

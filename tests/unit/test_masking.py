@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from geodelreg.errors import UsageError
-from geodelreg.image.quality import (
-    hidden_values,
-    impossible_values,
+from geodelreg.image.quality import hidden_values, impossible_values
+from geodelreg.masking import (
+    MaskSpec,
+    flag_bands,
     is_old_landsat,
+    parse_mask,
     quality_bands,
     quality_kind,
 )
-from geodelreg.masking import MaskSpec, parse_mask
 from geodelreg.options import AlignOptions
 
 # USGS, Landsat 8-9 Collection 2 Level 2 Science Product Guide (LSDS-1619), table 6-3, and for
@@ -127,6 +128,14 @@ def test_in_a_raster_descriptions_tell_and_of_one_band_the_file_name() -> None:
     assert quality_bands("a/SCL.tif", ("QA_PIXEL",)) == {1: "landsat-qa"}
     assert quality_bands("SCL/b.tif", (None,)) == {}
     assert quality_bands("a/SCL.tif", (None, None)) == {}
+
+
+def test_bands_of_flags_are_also_those_that_make_no_masks() -> None:
+    names = ("B2", None, "QA_PIXEL", "SCL", "QA_RADSAT", "pixel_qa", "SR_QA_AEROSOL", "ST_QA")
+    assert flag_bands("LC08_BQA.tif", names) == (3, 4, 5, 6, 7)
+    assert flag_bands("a/LC08_BQA.tif", (None,)) == (1,)
+    assert flag_bands("a/LC08_BQA.tif", ("x",)) == (1,)
+    assert flag_bands("QA60/B2.tif", ("x",)) == ()
 
 
 @pytest.mark.parametrize("dtype", ["uint16", "int32", "float32"])
