@@ -14,12 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geodelreg.errors import (
-    BandGridError,
-    BandNumberError,
-    NoDataError,
-    UsageError,
-)
+from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import bounded_cache, gdal_calls
@@ -346,31 +341,4 @@ def check_band(reader: RasterReader, number: int) -> None:
         raise BandNumberError(
             f"{reader.name} has no band {number}",
             f"Use 1 to {count}." if count > 1 else "It has band 1 only.",
-        )
-
-
-def check_texture(band: Band, file_name: str) -> None:
-    """Make sure that there is something to match.
-
-    Parameters
-    ----------
-    band : Band
-    file_name : str
-        For the message.
-
-    Raises
-    ------
-    NoDataError
-        If no pixel is valid, or all valid ones have the same value.
-    """
-    values = band.data[band.valid]
-    if values.size == 0:
-        raise NoDataError(
-            f"{file_name}: {band.name} has no valid pixel where it was read",
-            "Choose another band, or check the no-data value and the mask.",
-        )
-    if values.min() == values.max():
-        raise NoDataError(
-            f"{file_name}: {band.name} is constant ({values[0]:g}) where it was read",
-            "Choose another band.",
         )

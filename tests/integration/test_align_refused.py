@@ -125,19 +125,26 @@ def blank_pan(ms: Pixels, pan: Pixels) -> None:
     pan[:] = 7
 
 
+def no_pan(ms: Pixels, pan: Pixels) -> None:
+    pan[:] = 0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (blank_ms, "band 1 has the constant value 7"),
-        (no_ms, "band 1 has no valid pixel"),
-        (blank_pan, "band 1 has the constant value 7"),
+        (blank_ms, "ms.tif: band 1 has the constant value 7"),
+        (no_ms, "ms.tif: band 1 has no valid pixel"),
+        (blank_pan, "pan.tif: band 1 has the constant value 7"),
+        (no_pan, "pan.tif: band 1 has no valid pixel"),
     ],
 )
 def test_nothing_to_match(
     tmp_path: Path, change: Callable[[Pixels, Pixels], None], message: str
 ) -> None:
     scene = make_scene(tmp_path, replace(STANDARD, change=change, nodata=0))
-    assert message in str(refusal(NoDataError, scene.ms, scene.pan))
+    said = str(refusal(NoDataError, scene.ms, scene.pan))
+    assert message in said
+    assert "Choose another band, or check the no-data value and the mask" in said
 
 
 def test_no_overlap_in_headers_and_contents(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 from rasterio.env import get_gdal_config, set_gdal_config
 
-from geodelreg.errors import BandGridError, BandNumberError, NoDataError, UsageError
-from geodelreg.image.reader import check_band, check_texture, open_raster
+from geodelreg.errors import BandGridError, BandNumberError, UsageError
+from geodelreg.image.reader import check_band, open_raster
 from geodelreg.types import Band, Window
 from tests.conftest import TRANSFORM, WriteRaster
 
@@ -222,18 +222,6 @@ def test_wrong_band_number_says_what_there_is(write_raster: WriteRaster, number:
             check_band(reader, number)
         with pytest.raises(BandNumberError):
             reader.read([number], Window(0, 0, 5, 5))
-
-
-def test_bands_without_texture_are_refused(write_raster: WriteRaster) -> None:
-    constant = np.full((50, 70), 5, np.uint16)
-    (flat,) = read_all(write_raster("flat.tif", constant))
-    (empty,) = read_all(write_raster("empty.tif", constant, nodata=5))
-    (good,) = read_all(write_raster("good.tif", TEXTURE))
-    with pytest.raises(NoDataError, match=r"flat\.tif: band 1 is constant \(5\).*another band"):
-        check_texture(flat, "flat.tif")
-    with pytest.raises(NoDataError, match=r"empty\.tif: band 1 has no valid pixel.*no-data"):
-        check_texture(empty, "empty.tif")
-    check_texture(good, "good.tif")
 
 
 def test_large_blocks_are_named(write_raster: WriteRaster) -> None:
