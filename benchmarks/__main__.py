@@ -7,18 +7,24 @@ import importlib
 import sys
 
 COMMANDS = {
-    "scenes": ("benchmarks.scenes", "write the scenes with known truth"),
-    "sweep": ("benchmarks.sweep", "align many scenes: rotation, shift, scale, GSD ratio"),
-    "real": ("benchmarks.real_pairs", "align real pairs and measure them independently"),
-    "paper": ("benchmarks.paper", "the paper's experiments: SIFT, its method, ours, by ablation"),
-    "bound": ("benchmarks.bound", "errors against the Cramér–Rao bound"),
-    "gate": ("benchmarks.gate", "false accepts and false refusals of the gate"),
-    "peers": ("benchmarks.runner", "geodelreg and its peers side by side"),
-    "compare": ("benchmarks.peer_table", "two result files of `peers` as ratios"),
-    "scale": ("benchmarks.scale", "time and memory against the size of the rasters"),
-    "filters": ("benchmarks.filters", "mismatch filters against known truth"),
-    "fuzz": ("benchmarks.fuzz", "mutated inputs: no crash, hang or half-written file"),
-    "kills": ("benchmarks.kills", "kill -9 at random times: old or new files, nothing between"),
+    "scenes": ("benchmarks.scenes.make", "write the scenes with known truth"),
+    "sweep": ("benchmarks.accuracy.sweep", "align many scenes: rotation, shift, scale, GSD ratio"),
+    "real": ("benchmarks.accuracy.real_pairs", "align real pairs and measure them independently"),
+    "paper": (
+        "benchmarks.paper.run",
+        "the paper's experiments: SIFT, its method, ours, by ablation",
+    ),
+    "bound": ("benchmarks.accuracy.bound", "errors against the Cramér–Rao bound"),
+    "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
+    "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
+    "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
+    "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
+    "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),
+    "fuzz": ("benchmarks.robustness.fuzz", "mutated inputs: no crash, hang or half-written file"),
+    "kills": (
+        "benchmarks.robustness.kills",
+        "kill -9 at random times: old or new files, nothing between",
+    ),
 }
 
 

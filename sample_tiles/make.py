@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from benchmarks.imagery import sentinel2
-from benchmarks.scenes import HeaderError, SceneSpec, make_scene, write_scene
+from benchmarks.scenes.imagery import sentinel2
+from benchmarks.scenes.make import HeaderError, SceneSpec, make_scene, write_scene
 
 SAMPLE = SceneSpec(
     name="sample_tiles",

@@ -1,1 +1,1 @@
-"""Adapters of the tools that geodelreg is compared with; each runs in an environment of its own."""
+"""geodelreg and other tools, each in an environment of its own, on the same scenes."""

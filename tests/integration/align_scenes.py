@@ -1,7 +1,7 @@
 """Small scenes of real ground with known truth, as real files.
 
 The ground is the sample pair, pansharpened: 800 × 800 pixels of 10 m in four bands.  MS bands are
-rendered from it exactly (`benchmarks.simulate`), wherever and however their pixels lie.
+rendered from it exactly (`benchmarks.scenes.simulate`), wherever and however their pixels lie.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from scipy import ndimage
 
-from benchmarks.scenes import BAND_GAINS, BAND_GAMMAS, BLUR_MS_PX, PAN_GAMMA, PAN_WEIGHTS
-from benchmarks.simulate import Placement, digitise, render, tone
-from benchmarks.truth import Truth, grid_rmse
+from benchmarks.scenes.make import BAND_GAINS, BAND_GAMMAS, BLUR_MS_PX, PAN_GAMMA, PAN_WEIGHTS
+from benchmarks.scenes.simulate import Placement, digitise, render, tone
+from benchmarks.scenes.truth import Truth, grid_rmse
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_tiles"
 HEADER_ERROR = Affine.translation(1.84, -1.16)

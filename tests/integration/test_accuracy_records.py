@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from benchmarks.imagery import Imagery, sample_imagery
-from benchmarks.sweep import SAMPLE, run_case, sample_cases, worse_than_recorded
+from benchmarks.accuracy.sweep import SAMPLE, run_case, sample_cases, worse_than_recorded
+from benchmarks.scenes.imagery import Imagery, sample_imagery
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import rasterio
 from affine import Affine
 from pyproj import CRS
 
-from benchmarks.truth import Truth
+from benchmarks.scenes.truth import Truth
 from geodelreg import AlignOptions, align
 from geodelreg.types import Alignment, Outcome
 from tests.integration.align_scenes import (

@@ -15,8 +15,8 @@ from rasterio.transform import from_gcps
 from rasterio.vrt import WarpedVRT
 
 import geodelreg
-from benchmarks.measure import MeasureOptions, measure_offsets, read_raster
-from benchmarks.truth import Truth
+from benchmarks.accuracy.measure import MeasureOptions, measure_offsets, read_raster
+from benchmarks.scenes.truth import Truth
 from geodelreg import Alignment, AlignOptions, WriteOptions
 from geodelreg.errors import AlignmentRefusedError, OutputIsInputError
 from geodelreg.product.gcps import read_gcps

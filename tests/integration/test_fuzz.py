@@ -16,8 +16,8 @@ import click
 import pytest
 
 import geodelreg
-from benchmarks.fuzz import Worker
-from benchmarks.fuzz_cases import GCPS, SHIFT, TAGS, WRITE_OPTIONS, run_case, seeds
+from benchmarks.robustness.fuzz import Worker
+from benchmarks.robustness.fuzz_cases import GCPS, SHIFT, TAGS, WRITE_OPTIONS, run_case, seeds
 from geodelreg.errors import GeodelregError
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg.product.geotiff import write_corrected

@@ -9,8 +9,8 @@ import pytest
 import rasterio
 from affine import Affine
 
-from benchmarks.measure import MeasureOptions, measure_offsets, read_raster
-from benchmarks.truth import Truth, grid_rmse
+from benchmarks.accuracy.measure import MeasureOptions, measure_offsets, read_raster
+from benchmarks.scenes.truth import Truth, grid_rmse
 
 SAMPLE = Path(__file__).parents[2] / "sample_tiles"
 SIZE_LIMIT_BYTES = 3_000_000

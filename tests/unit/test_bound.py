@@ -7,8 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.bound import Knowledge, Signal, bounds, fisher, jacobian, rmse_bound, spread
-from benchmarks.truth import check_points
+from benchmarks.accuracy.bound import (
+    Knowledge,
+    Signal,
+    bounds,
+    fisher,
+    jacobian,
+    rmse_bound,
+    spread,
+)
+from benchmarks.scenes.truth import check_points
 
 SHAPE = (30, 40)
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5

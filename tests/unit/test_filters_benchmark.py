@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import filters
-from benchmarks.filters import FILTERS, Case, Row, draw_matches, measure, reach
+from benchmarks.accuracy import filters
+from benchmarks.accuracy.filters import FILTERS, Case, Row, draw_matches, measure, reach
 
 CASE = Case(100, 2.0, 0.3, 0.0, 0.0)
 

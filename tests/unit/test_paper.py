@@ -9,9 +9,9 @@ import pytest
 from affine import Affine
 from pyproj import CRS
 
-from benchmarks import paper_methods
-from benchmarks.paper_ablation import ALL, NONE, compositions, interval
-from benchmarks.paper_methods import (
+from benchmarks.paper import methods
+from benchmarks.paper.ablation import ALL, NONE, compositions, interval
+from benchmarks.paper.methods import (
     STEPS,
     Matched,
     Stage,
@@ -25,9 +25,9 @@ from benchmarks.paper_methods import (
     set_stage,
     true_rmse,
 )
-from benchmarks.paper_scenes import crop_pan
-from benchmarks.scenes import Scene
-from benchmarks.truth import Truth
+from benchmarks.paper.scenes import crop_pan
+from benchmarks.scenes.make import Scene
+from benchmarks.scenes.truth import Truth
 from geodelreg.match.keypoints import KeypointOptions, detect
 from geodelreg.match.zhang2013 import match_sift, match_zhang2013
 from geodelreg.types import Band, Float32Array, Grid, Status, Window
@@ -85,8 +85,7 @@ def test_all_steps_are_the_librarys_method_and_none_its_baseline(
     band, pan = stage.images.source[0], stage.images.reference
     options = KeypointOptions(root=False)
     keypoints = [
-        detect(paper_methods.to_uint8(b), b.valid, options)
-        for b in (paper_methods.mean_band([band]), pan)
+        detect(methods.to_uint8(b), b.valid, options) for b in (methods.mean_band([band]), pan)
     ]
     for names, library in ((tuple(STEPS), match_zhang2013), ((), match_sift)):
         points, counts = library(*keypoints)

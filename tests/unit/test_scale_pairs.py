@@ -9,10 +9,10 @@ import pytest
 from affine import Affine
 from pyproj import CRS
 
-from benchmarks.imagery import Imagery
-from benchmarks.scale import PLAIN, Row, growth, table
-from benchmarks.scale_pairs import EndlessGround, integration_axis, pair_truth
-from benchmarks.truth import grid_rmse
+from benchmarks.scale.pairs import EndlessGround, integration_axis, pair_truth
+from benchmarks.scale.run import PLAIN, Row, growth, table
+from benchmarks.scenes.imagery import Imagery
+from benchmarks.scenes.truth import grid_rmse
 
 
 @pytest.fixture(scope="module")

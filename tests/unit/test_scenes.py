@@ -11,12 +11,12 @@ from affine import Affine
 from pyproj import CRS, Transformer
 from scipy import ndimage
 
-from benchmarks.ground import Ground, cloud_layer, cover_with
-from benchmarks.imagery import Imagery
-from benchmarks.measure import MeasureOptions, Raster, measure_offsets
-from benchmarks.scenes import HeaderError, Scene, SceneSpec, make_scene, write_scene
-from benchmarks.simulate import affine_placement, render, system_mtf
-from benchmarks.truth import Truth, check_points, grid_rmse
+from benchmarks.accuracy.measure import MeasureOptions, Raster, measure_offsets
+from benchmarks.scenes.ground import Ground, cloud_layer, cover_with
+from benchmarks.scenes.imagery import Imagery
+from benchmarks.scenes.make import HeaderError, Scene, SceneSpec, make_scene, write_scene
+from benchmarks.scenes.simulate import affine_placement, render, system_mtf
+from benchmarks.scenes.truth import Truth, check_points, grid_rmse
 
 UTM18 = CRS.from_epsg(32618).to_wkt()
 WAVES = ((0.031, 0.012, 0.3), (-0.02, 0.05, 1.1), (0.09, -0.07, 2.0))

@@ -14,12 +14,12 @@ import pytest
 from affine import Affine
 from pyproj import CRS
 
-from benchmarks import peer_table
-from benchmarks.environments import Peer, PeerUnavailableError, environment
+from benchmarks.peers import table
+from benchmarks.peers.environments import Peer, PeerUnavailableError, environment
+from benchmarks.peers.run import OWN, Result, Tool, measured, read_transform, run_tool
 from benchmarks.report import replace_section
-from benchmarks.runner import OWN, Result, Tool, measured, read_transform, run_tool
-from benchmarks.scenes import write_raster
-from benchmarks.truth import Truth
+from benchmarks.scenes.make import write_raster
+from benchmarks.scenes.truth import Truth
 
 UTM18 = CRS.from_epsg(32618).to_wkt()
 TRUTH = Truth(
@@ -88,7 +88,7 @@ def test_resources_are_those_of_the_child(tmp_path: Path) -> None:
     busy = "import time\nwhile time.process_time() < 0.4: pass"
     command = [sys.executable, "-c", f"{hungry}\n{busy}"]
     small = (  # the process that runs the tests may be larger than the child
-        "import dataclasses, json, pathlib; from benchmarks.runner import measured;"
+        "import dataclasses, json, pathlib; from benchmarks.peers.run import measured;"
         f"usage = measured({command!r}, {{}}, 60, pathlib.Path({str(tmp_path)!r}));"
         "print(json.dumps(dataclasses.asdict(usage)))"
     )
@@ -163,7 +163,7 @@ def test_comparison_reports_what_got_worse(
 ) -> None:
     before = _save(tmp_path / "before.json", _result())
     after = _save(tmp_path / "after.json", _result(**change))
-    assert peer_table.run(Namespace(before=before, after=after, tolerance=1.25)) == worse
+    assert table.run(Namespace(before=before, after=after, tolerance=1.25)) == worse
     assert ("WORSE" in capsys.readouterr().out) == bool(worse)
 
 
@@ -179,7 +179,7 @@ def test_page_names_the_best_and_the_fastest_peer_and_the_wrong_ones(tmp_path: P
         _result(tool="broken", rmse_px=float("nan"), failure="no luck"),
     )
     page = tmp_path / "docs" / "page.md"
-    peer_table.write_page(source, page)
+    table.write_page(source, page)
     text = page.read_text()
     assert (
         "| A | geodelreg: 0.0040 px, 2.0 s | accurate, default: 0.0100 px, 30.0 s "

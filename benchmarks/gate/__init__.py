@@ -1,0 +1,1 @@
+"""How often the gate lets a wrong alignment through, and how often it refuses a right one."""

@@ -1,0 +1,1 @@
+"""The paper's experiments on open data: its method, ours, and each step by ablation."""

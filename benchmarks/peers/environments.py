@@ -1,0 +1,148 @@
+"""The peers, and the environment of each, built where it can be."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+ROOT = Path(__file__).parents[2]
+ADAPTERS = Path(__file__).parent / "adapters"
+BUILD_TIMEOUT_S = 1200.0
+RASTERS = ("rasterio>=1.4", "pyproj>=3.6", "numpy")
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A tool to compare with.
+
+    Attributes
+    ----------
+    name : str
+        As in the table.
+    script : str
+        Adapter in ``benchmarks/peers/adapters``.
+    requirements : tuple of tuple of str
+        Arguments of one ``pip install`` after the other.
+    settings : tuple of str
+        Settings of the adapter, tried on every scene.
+    python : str or None
+        Interpreter to build on; this one when None.
+    probe : str
+        Statement that must run in the environment.
+    command : str or None
+        Executable that must be there, installed by hand (Debian's packages).
+    """
+
+    name: str
+    script: str
+    requirements: tuple[tuple[str, ...], ...]
+    probe: str
+    settings: tuple[str, ...] = ("default", "best")
+    python: str | None = None
+    command: str | None = None
+
+
+AROSICS_INSTALLS = (
+    ("setuptools<70", "wheel", "numpy<2"),
+    ("--no-build-isolation", "--no-deps", "gdal==3.6.2.*"),
+    ("--no-deps", "arosics==1.13.2", "geoarray==0.19.0", "py_tools_ds==0.23.2"),
+    (
+        "numpy<2", "cartopy", "cmocean", "folium>=0.6,!=0.12.0", "geojson", "geopandas",
+        "joblib>=1.3", "matplotlib", "pandas", "plotly", "pyproj", "scikit-image", "scipy",
+        "shapely", "packaging", "spectral", "dill", "pykrige", "scikit-learn",
+    ),
+)  # fmt: skip
+
+OPENCV = (("opencv-python-headless>=5", *RASTERS),)
+
+PEERS: tuple[Peer, ...] = (
+    Peer("OpenCV SIFT + RANSAC", "opencv_sift", OPENCV, "import cv2"),
+    Peer("OpenCV ECC", "opencv_ecc", OPENCV, "import cv2"),
+    Peer("phase correlation", "phase_correlation", (("scikit-image", *RASTERS),), "import skimage"),
+    Peer("SimpleITK affine MI", "simpleitk", (("SimpleITK", *RASTERS),), "import SimpleITK"),
+    Peer("elastix affine", "elastix", (("itk-elastix", *RASTERS),), "import itk"),
+    Peer("AROSICS", "arosics_peer", AROSICS_INSTALLS, "import arosics", python="/usr/bin/python3"),
+    Peer("pandora2d", "pandora2d_peer", (("pandora2d==1.2.0", *RASTERS),), "import pandora2d"),
+    Peer("coregix", "coregix_peer", (("coregix==0.3.0", "scipy", *RASTERS),), "import coregix"),
+    Peer(
+        "OTB SIFT", "otb_sift", OPENCV, "import cv2",
+        command="otbcli_HomologousPointsExtraction",
+    ),
+)  # fmt: skip
+
+
+class PeerUnavailableError(Exception):
+    """The peer's environment cannot be built here."""
+
+
+def environment(peer: Peer, cache: Path) -> Path:
+    """Interpreter of a peer's environment, built in `cache` when it is not there yet.
+
+    Peers with the same requirements share one.  A failed build is remembered; delete its folder to
+    try again.
+
+    Raises
+    ------
+    PeerUnavailableError
+        With the reason.
+    """
+    if peer.command and not shutil.which(peer.command):
+        raise PeerUnavailableError(f"{peer.command} is not installed")
+    twin = next((p for p in PEERS if p.requirements == peer.requirements), peer)
+    folder = cache / twin.script
+    python, failure = folder / "bin" / "python", folder / "failure.txt"
+    if failure.exists():
+        raise PeerUnavailableError(failure.read_text().strip())
+    if not (folder / "ready").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        reason = _build(twin, folder, python)
+        if reason:
+            folder.mkdir(parents=True, exist_ok=True)
+            failure.write_text(reason)
+            raise PeerUnavailableError(reason)
+        (folder / "ready").touch()
+    return python
+
+
+def _build(peer: Peer, folder: Path, python: Path) -> str:
+    """Build; the reason when it fails, else ''."""
+    pip = [] if peer.requirements else ["--without-pip"]
+    steps = [[peer.python or sys.executable, "-m", "venv", *pip, str(folder)]]
+    steps += [[str(python), "-m", "pip", "install", "-q", *step] for step in peer.requirements]
+    steps.append([str(python), "-c", peer.probe])
+    for step in steps:
+        log.info("%s: %s", peer.name, " ".join(step))
+        try:
+            done = subprocess.run(
+                step, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return f"{type(error).__name__} in {' '.join(step[1:4])}"
+        if done.returncode:
+            lines = [line for line in done.stderr.splitlines() if "error" in line.lower()]
+            return (lines or done.stderr.splitlines() or ["failed"])[-1].strip()[:200]
+    return ""
+
+
+def own_command(scene: Path, out: Path) -> list[str]:
+    """Command line of geodelreg itself, as a user runs it: start-up and output included."""
+    return [
+        sys.executable, "-m", "geodelreg_cli", "align", str(scene / "ms.tif"),
+        str(scene / "pan.tif"), "-o", str(out), "--quiet",
+    ]  # fmt: skip
+
+
+def own_environment() -> dict[str, str]:
+    """Environment variables under which this checkout's geodelreg is found.
+
+    Its byte code is kept, as pip keeps that of an installed copy and of every peer.
+    """
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "cli")])
+    rest = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    return {**rest, "PYTHONPATH": paths}

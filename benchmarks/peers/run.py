@@ -1,0 +1,219 @@
+"""geodelreg and its peers side by side: error, wall time, CPU time and peak memory."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from affine import Affine
+
+from benchmarks.peers.environments import (
+    ADAPTERS,
+    PEERS,
+    PeerUnavailableError,
+    environment,
+    own_command,
+    own_environment,
+)
+from benchmarks.report import machine
+from benchmarks.scenes.truth import Truth, grid_rmse
+
+OWN = "geodelreg"
+CACHE = Path(__file__).parents[1] / ".cache"
+QUICK_SCENES = ("A", "C", "G")
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One run of one tool on one scene; errors in PAN pixels, NaN when it found nothing.
+
+    Attributes
+    ----------
+    wall_s, cpu_s : float
+        Of the whole process and its children, start-up included.
+    peak_mb : float
+        Largest resident set of any one process.
+    failure : str
+        Why there is no error figure; "" when there is one.
+    """
+
+    scene: str
+    tool: str
+    setting: str
+    rmse_px: float
+    p95_px: float
+    max_px: float
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    failure: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """Something that can be run on a scene: geodelreg, or a peer with a setting."""
+
+    name: str
+    setting: str
+    python: Path | None
+    script: Path | None
+
+    def command(self, scene: Path, out: Path) -> list[str]:
+        """Command line that writes `out` (a GeoTIFF for geodelreg, JSON for a peer)."""
+        if self.script is None:
+            return own_command(scene, out)
+        return [
+            str(self.python), str(self.script), "--ms", str(scene / "ms.tif"),
+            "--pan", str(scene / "pan.tif"), "--out", str(out), "--setting", self.setting,
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a process cost and how it ended."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    status: int
+    last_line: str
+
+
+def measured(command: list[str], env: dict[str, str], timeout_s: float, folder: Path) -> Usage:
+    """Run a command as a session of its own and read its resources from the kernel.
+
+    The kernel counts a child's peak from the fork on, when it still is its parent: call this from a
+    process that is smaller than what it measures.
+    """
+    with (folder / "stderr.txt").open("w+b") as errors:
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=errors, env=env, cwd=folder,
+            start_new_session=True,
+        )  # fmt: skip
+        stop = threading.Timer(timeout_s, _kill_session, [process.pid])
+        stop.start()
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - started
+        stop.cancel()
+        process.returncode = os.waitstatus_to_exitcode(status)
+        errors.seek(0)
+        lines = errors.read().decode(errors="replace").strip().splitlines()
+    last = lines[-1].strip() if lines else ""
+    if wall >= timeout_s:
+        last = f"stopped after {timeout_s:g} s"
+    return Usage(
+        wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, process.returncode, last
+    )
+
+
+def _kill_session(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
+
+
+def read_transform(out: Path) -> Affine:
+    """Corrected geotransform of MS that a tool left."""
+    if out.suffix == ".json":
+        return Affine(*json.loads(out.read_text())["transform"])
+    import rasterio
+
+    with rasterio.open(out) as raster:
+        return Affine(*tuple(raster.transform)[:6])
+
+
+def run_tool(tool: Tool, scene: Path, timeout_s: float) -> Result:
+    """Run a tool on copies of a scene's rasters, without the truth, and score it."""
+    truth = Truth.load(scene / "truth.json")
+    env = own_environment() if tool.script is None else {**os.environ, "PYTHONPATH": ""}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for raster in ("ms.tif", "pan.tif"):
+            shutil.copy(scene / raster, folder / raster)
+        out = folder / ("out.tif" if tool.script is None else "out.json")
+        usage = measured(tool.command(folder, out), env, timeout_s, folder)
+        error, failure = dict.fromkeys(("rmse_px", "p95_px", "max_px"), math.nan), ""
+        if usage.status or not out.exists():
+            failure = usage.last_line[:200] or f"exit {usage.status}"
+        else:
+            error = grid_rmse(read_transform(out), truth)
+    return Result(
+        truth.name, tool.name, tool.setting, **error, wall_s=usage.wall_s, cpu_s=usage.cpu_s,
+        peak_mb=usage.peak_mb, failure=failure,
+    )  # fmt: skip
+
+
+def available_tools(cache: Path, only: set[str]) -> Iterator[Tool]:
+    """geodelreg, then every peer that can be built; the others are named with the reason."""
+    yield Tool(OWN, "default", None, None)
+    for peer in PEERS:
+        if only and peer.script not in only:
+            continue
+        try:
+            python = environment(peer, cache)
+        except PeerUnavailableError as error:
+            print(f"{peer.name}: skipped, {error}", flush=True)
+            continue
+        for setting in peer.settings:
+            yield Tool(peer.name, setting, python, ADAPTERS / f"{peer.script}.py")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``python -m benchmarks peers``."""
+    parser.add_argument("--scenes", type=Path, required=True, help="folder that `scenes` wrote")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="JSON file for the results; a run continues it"
+    )
+    parser.add_argument("--only", default="", help="scenes, comma-separated")
+    parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
+    parser.add_argument("--quick", action="store_true", help="scenes A, C and G only")
+    parser.add_argument("--repeat", type=int, default=1, help="runs of each, the fastest counts")
+    parser.add_argument("--timeout", type=float, default=300.0, help="seconds a run may take")
+    parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
+    parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run every tool on every scene, one after the other, and write the results."""
+    tools = list(available_tools(args.envs, {name for name in args.peers.split(",") if name}))
+    wanted = {name for name in args.only.split(",") if name}
+    wanted = wanted or (set(QUICK_SCENES) if args.quick else set())
+    host, results = machine(), []
+    if args.out.exists():
+        results = [Result(**row) for row in json.loads(args.out.read_text())["results"]]
+    done = {(result.scene, result.tool, result.setting) for result in results}
+    for scene in sorted(path.parent for path in args.scenes.glob("*/truth.json")):
+        if wanted and scene.name not in wanted:
+            continue
+        for tool in tools:
+            if (Truth.load(scene / "truth.json").name, tool.name, tool.setting) in done:
+                continue
+            runs = [run_tool(tool, scene, args.timeout) for _ in range(args.repeat)]
+            best = min(runs, key=lambda result: result.wall_s)
+            results.append(best)
+            print(
+                f"{best.scene} {best.tool} ({best.setting}): {best.rmse_px:.4f} px, "
+                f"{best.wall_s:.1f} s, {best.cpu_s:.1f} CPU s, {best.peak_mb:.0f} MB "
+                f"{best.failure}",
+                flush=True,
+            )
+            args.out.write_text(
+                json.dumps({"machine": host, "results": [asdict(r) for r in results]}, indent=2)
+            )
+    if args.docs:
+        from benchmarks.peers.table import write_page
+
+        write_page(args.out, args.docs)
+    return 0

@@ -1,0 +1,1 @@
+"""Broken inputs, and kills at random times: no crash, hang or half-written file."""

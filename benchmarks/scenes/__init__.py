@@ -1,0 +1,1 @@
+"""Pairs with known truth, rendered from real imagery."""
