@@ -17,8 +17,8 @@ import rasterio
 import tifffile
 from rasterio.shutil import copy as gdal_copy
 
-from benchmarks.fuzz_seeds import make_seeds
-from benchmarks.mutations import parse
+from benchmarks.robustness.mutations import parse
+from benchmarks.robustness.seeds import make_seeds
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.fatal import check_survivable
 from geodelreg.image.reader import open_raster
