@@ -31,8 +31,11 @@ from geodelreg.types import BoolArray, Float32Array, Grid, Window
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-_PIECE_PIXELS = 1_000_000
+_PIECE_PIXELS = 1 << 20
 """Pixels (of all bands together) that a thread of a decimated read holds at a time."""
+
+_WHOLE_BLOCK_PIXELS = 4 * _PIECE_PIXELS
+"""Up to so many, a block is read whole: one that is cut is decoded for each of its parts."""
 
 _MOST_THREADS = 4
 _PIECES_PER_THREAD = 4
@@ -304,9 +307,10 @@ def _pieces(
     block_height, block_width = (int(side) for side in dataset.block_shapes[0])
     pixels = max(_PIECE_PIXELS // bands, 1)
     rows = max(pixels // (right - left) // block_height, 1) * block_height
-    rows = min(rows, max(pixels // min(right - left, block_width), 1))
     columns = max(pixels // rows // block_width, 1) * block_width
-    columns = min(columns, max(pixels // rows, 1))
+    if block_height * min(right - left, block_width) * bands > _WHOLE_BLOCK_PIXELS:
+        rows = min(rows, max(pixels // min(right - left, block_width), 1))
+        columns = min(columns, max(pixels // rows, 1))
     return [
         Window(x0, y0, x1 - x0, y1 - y0)
         for y0, y1 in _cuts(top, bottom, rows)

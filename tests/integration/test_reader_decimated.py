@@ -228,3 +228,19 @@ with open_raster(sys.argv[1]) as reader:
 """
     grown_kib = int(subprocess.check_output([sys.executable, "-c", script, str(path)]))
     assert grown_kib < 150_000  # the raster itself has 390 MB
+
+
+@pytest.mark.parametrize("bands", [1, 4, 8])
+@pytest.mark.parametrize("side", [256, 512])
+def test_pieces_cut_no_block(write_raster: WriteRaster, bands: int, side: int) -> None:
+    """A block that is cut is decoded once for each of its parts."""
+    data = np.ones((1, 1100, 1300), dtype=np.uint8)
+    path = write_raster("a.tif", data, tiled=True, blockxsize=side, blockysize=side)
+    with rasterio.open(path) as dataset:
+        pieces = geodelreg.image.raster_file._pieces(dataset, (0, 0), (1300, 1100), bands)
+    assert sum(piece.width * piece.height for piece in pieces) == data.size
+    for piece in pieces:
+        assert piece.column % side == 0
+        assert piece.row % side == 0
+        assert (piece.column + piece.width) % side == 0 or piece.column + piece.width == 1300
+        assert (piece.row + piece.height) % side == 0 or piece.row + piece.height == 1100
