@@ -196,7 +196,11 @@ def _acquire(folder: Path, target: Path) -> int:
     """Descriptor of the locked file in `folder`; both are created."""
     lock = folder / "lock"
     while True:
-        folder.mkdir(exist_ok=True)
+        try:
+            folder.mkdir()
+        except FileExistsError:  # by now, its owner may have removed it
+            if os.path.lexists(folder) and not folder.is_dir():
+                raise
         try:
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
         except FileNotFoundError:  # the previous owner has just removed the folder

@@ -18,8 +18,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 HOLD_A_TEMPORARY = """
-import sys, tempfile, time
+import signal, sys, tempfile, time
 import click
+# what a background job or nohup ignores ends the process again
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 import geodelreg_cli.main as main
 
 @main.cli.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
 import random
 import signal
 import subprocess
@@ -243,6 +244,31 @@ def test_many_processes_write_one_target(tmp_path: Path) -> None:
             assert path.read_text() in {letter * 5000 for letter in "abc"}
     assert [process.wait() for process in processes] == [0, 0, 0]
     assert names(tmp_path) == {"out.txt"}
+
+
+def test_a_private_folder_that_vanishes_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its owner may remove it between the refusal to create it and a look at it."""
+    real, calls = os.mkdir, []
+
+    def mkdir(path: Path, mode: int = 0o777) -> None:
+        calls.append(path)
+        if len(calls) == 1:
+            raise FileExistsError(errno.EEXIST, "File exists", str(path))
+        real(path, mode)
+
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    write_text_atomically(tmp_path / "out.txt", "text", overwrite=False)
+    assert (tmp_path / "out.txt").read_text() == "text"
+    assert names(tmp_path) == {"out.txt"}
+
+
+def test_a_file_in_the_place_of_the_private_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / ".out.txt.geodelreg").write_text("mine")
+    with pytest.raises(OutputUnwritableError):
+        write_text_atomically(tmp_path / "out.txt", "text", overwrite=False)
+    assert (tmp_path / ".out.txt.geodelreg").read_text() == "mine"
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
