@@ -237,6 +237,9 @@ def _examine(
 
 
 def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
+    masks = mask_uses(rasters.ms, rasters.pan)
+    units = (pair.source.grid.unit_m, pair.reference.grid.unit_m)
+    through_proj = pair.mapping.matrix is None or None in units or bool(masks)
     return Alignment(
         source=pair.source.grid,
         reference=pair.reference.grid,
@@ -251,9 +254,9 @@ def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
         warnings=solution.warnings,
         crs_operation=pair.mapping.operation.description,
         options=pair.options,
-        versions=versions(with_proj=pair.mapping.matrix is None),
+        versions=versions(with_proj=through_proj),
         timings_s=solution.timings_s,
-        masks=mask_uses(rasters.ms, rasters.pan),
+        masks=masks,
     )
 
 

@@ -17,7 +17,7 @@ _COMPRESSION, _PHOTOMETRIC, _SAMPLES, _PLANAR = 259, 262, 277, 284
 _TILE_WIDTH, _TILE_LENGTH = 322, 323
 _TAGS = (_COMPRESSION, _PHOTOMETRIC, _SAMPLES, _PLANAR, _TILE_WIDTH, _TILE_LENGTH)
 _YCBCR, _UNCOMPRESSED, _CONTIGUOUS = 6, 1, 1
-_CODES = {1: "B", 3: "H", 4: "I", 16: "Q"}
+_CODES = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}
 _CLASSIC = ("H", "HHI4s", "I")
 _BIG = ("Q", "HHQ8s", "Q")
 """How a directory's length, its entries and offsets are encoded."""

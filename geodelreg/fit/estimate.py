@@ -163,7 +163,7 @@ def robust_fit(
             break
         previous = parameters
     inlier = distance2 < _REJECT_D2
-    sandwich = _sandwich(model, points, inverse * student[:, None, None], residual, normal, frame)
+    sandwich = _sandwich(columns, inverse * student[:, None, None], residual, normal, frame)
     sandwich = sandwich / _response(distance2) ** 2
     return Estimate(
         transformation(model, parameters, frame),
@@ -183,8 +183,7 @@ def _inverse(covariance: FloatArray, extra: float) -> FloatArray:
 
 
 def _sandwich(
-    model: str,
-    points: Observations,
+    columns: FloatArray,
     weight: FloatArray,
     residual: FloatArray,
     normal: FloatArray,
@@ -195,7 +194,6 @@ def _sandwich(
     Huber–White's sandwich, HC3 (MacKinnon & White 1985, doi:10.1016/0304-4076(85)90158-7): a point
     that holds the fit by itself shows a small residual, not a small error.
     """
-    columns, _ = design(model, points.source, frame)
     bread = np.linalg.pinv(normal, hermitian=True)
     own = np.einsum("nik,kl,njl,nji->n", columns, bread, columns, weight) * frame.span_px**2 / 2
     left_out = residual / (1.0 - np.minimum(own, _MOST_LEVERAGE))[:, None]
@@ -231,6 +229,8 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
 
 def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
     """`common_variance` from the eigenvalues and eigenvectors of the covariances."""
+    if not residual.any():
+        return 0.0
     one, other = np.einsum("nji,nj->in", axes, residual) ** 2
     first, second = np.ascontiguousarray(variances.T)
 
@@ -239,19 +239,22 @@ def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray
 
     low, high = 0.0, _median((residual**2).sum(axis=1)) + 1e-12
     at_low = 1.0 - _MEDIAN_CHI2_2 / max(median_at(low), 1e-300)
-    if at_low <= 0.0:
+    if not at_low > 0.0:
         return 0.0
     at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), 1e-300)
     # the median's inverse is nearly linear in `extra`: Illinois' false position is quick
+    kept = 0
     for _ in range(_MOST_STEPS):
         middle = high - at_high * (high - low) / (at_high - at_low)
         here = 1.0 - _MEDIAN_CHI2_2 / median_at(middle)
         if abs(here) < _CLOSE:
             return float(middle)
         if here > 0.0:
-            low, at_low, at_high = middle, here, at_high / 2
+            low, at_low = middle, here
+            at_high, kept = (at_high / 2 if kept > 0 else at_high), 1
         else:
-            high, at_high, at_low = middle, here, at_low / 2
+            high, at_high = middle, here
+            at_low, kept = (at_low / 2 if kept < 0 else at_low), -1
     return float(high)
 
 

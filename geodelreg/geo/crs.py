@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from pyproj import Transformer
 
 logger = logging.getLogger(__name__)
+
+_ONE_AT_A_TIME = Lock()
+"""Of a transformation; pyproj makes those that it lists for a pair of CRSs for one thread each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +117,8 @@ def map_points(xy: FloatArray, from_wkt: str, to_wkt: str) -> FloatArray:
     points = np.asarray(xy, dtype=np.float64)
     if transformer is None:
         return points.copy()
-    x, y = transformer.transform(points[..., 0].ravel(), points[..., 1].ravel())
+    with _ONE_AT_A_TIME:
+        x, y = transformer.transform(points[..., 0].ravel(), points[..., 1].ravel())
     out = np.stack([x, y], axis=-1).reshape(points.shape)
     out[~np.isfinite(out)] = np.nan
     return out

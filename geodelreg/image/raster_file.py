@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
 _PIECE_PIXELS = 1 << 20
-"""Pixels (of all bands together) that a thread of a decimated read holds at a time."""
+"""Pixels (of all bands together) that a thread of a decimated read holds at a time, or a block."""
 
 _WHOLE_BLOCK_PIXELS = 4 * _PIECE_PIXELS
 """Up to so many, a block is read whole: one that is cut is decoded for each of its parts."""

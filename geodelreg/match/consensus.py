@@ -342,14 +342,14 @@ def _fitted(source: FloatArray, reference: FloatArray, near: BoolArray, kind: st
     """(S, 2, 3) `fit_matrix` of the points that are near each of S hypotheses, (S, M)."""
     weight = near.astype(np.float64)
     total = weight.sum(axis=1)[:, None]
-    # einsum, for BLAS may round differently from one thread count to another
+    # einsum throughout, for BLAS may round differently from one thread count to another
     source_mean, reference_mean = (
         np.einsum("sm,mk->sk", weight, xy) / total for xy in (source, reference)
     )
     s, r = source - source_mean[:, None], reference - reference_mean[:, None]
     s *= weight[:, :, None]
-    across = np.matmul(s.transpose(0, 2, 1), r)
-    normal = np.matmul(s.transpose(0, 2, 1), s)
+    across = np.einsum("smi,smj->sij", s, r)
+    normal = np.einsum("smi,smj->sij", s, s)
     if kind == "similarity":
         power = np.maximum(normal[:, 0, 0] + normal[:, 1, 1], np.finfo(np.float64).tiny)
         along = (across[:, 0, 0] + across[:, 1, 1]) / power

@@ -242,7 +242,7 @@ def _grouped(tiles: list[Tile], options: RefineOptions) -> Iterator[list[Tile]]:
     for tile in tiles:
         height, width = tile.template[0].data.shape
         group.append(tile)
-        count += (height // options.size) * (width // options.size) // options.every
+        count += -(-(height // options.size) * (width // options.size) // options.every)
         if count >= _GROUP_PATCHES:
             yield group
             group, count = [], 0

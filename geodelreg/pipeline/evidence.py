@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -133,7 +133,7 @@ def best_in_place(scores: FloatArray) -> AreaEvidence:
 
 
 def bands_apart(
-    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int, threads: int
+    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, size: int, pool: Executor
 ) -> float:
     """How far apart two bands put the ground by themselves, beyond their standard errors.
 
@@ -143,8 +143,10 @@ def bands_apart(
 
     Parameters
     ----------
-    part, tiles, matrix, tuning, size, threads
+    part, tiles, matrix, tuning, size
         As for `geodelreg.pipeline.dense.match_pass`.
+    pool : Executor
+        Matches the bands, each in one thread.
 
     Returns
     -------
@@ -165,9 +167,7 @@ def bands_apart(
         alone = replace(tuning, tone=single_band(count, band), local_tone=False)
         return match_pass(part, some, matrix, alone, options, 1)
 
-    # the tiles still hold the last pass's surfaces, so that the threads share them and make none
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        matched = list(pool.map(by_itself, _spread(count, _BANDS) if count > 1 else []))
+    matched = list(pool.map(by_itself, _spread(count, _BANDS) if count > 1 else []))
     found = []
     for dense in matched:
         if dense.estimate is not None:

@@ -121,6 +121,8 @@ def _of_the_ground(
     """Refine on all pixels, unless those off bright objects (clouds?) say something else.
 
     Clouds are bright and smooth, and move; the ground is darker, has sharp edges, and does not.
+    Where both agree on the place, bright objects are left out if nearly all others agree, or agree
+    on more than a shift, or tell the place more sharply.
     """
     everything = _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
     if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
@@ -137,8 +139,11 @@ def _of_the_ground(
     if not _agree(part, ground, everything):
         return replace(ground, without_bright=True)
     sigma = _difference(part, ground.dense, everything.dense)[1]
-    more = _kept(ground) >= _kept(everything)
-    return ground if more or sigma[0] < _CLEARLY * sigma[1] else everything
+    if _is_calm(ground.dense) and not _is_calm(everything.dense):
+        return ground  # what disagrees is bright
+    if _is_shift(ground.dense) != _is_shift(everything.dense):
+        return everything if _is_shift(ground.dense) else ground
+    return ground if sigma[0] < _CLEARLY * sigma[1] else everything
 
 
 def _kept(one: Refinement) -> int:
@@ -170,11 +175,16 @@ def _near_header(part: Roles, matrix: FloatArray) -> bool:
     return bool(np.hypot(*gap.T).max() < _NEAR_HEADER_PX * step)
 
 
-def _scatter(one: Refinement) -> float:
-    """Mean standard error: the start from which more patches agree more closely has less."""
+def _is_shift(dense: Dense) -> bool:
+    """True when so few patches matched that nothing but a shift was fitted."""
+    assert dense.estimate is not None
+    return dense.estimate.transformation.model == "shift"
+
+
+def _preference(one: Refinement) -> tuple[bool, float]:
+    """Less for the start from which more patches agree more closely: model, then variance."""
     assert one.dense.estimate is not None
-    spread = np.diag(one.dense.estimate.covariance)
-    return float(spread.sum())
+    return _is_shift(one.dense), float(np.diag(one.dense.estimate.covariance).sum())
 
 
 def _difference(part: Roles, one: Dense, other: Dense) -> tuple[float, tuple[float, float]]:
@@ -197,20 +207,23 @@ def _passes(
 ) -> Refinement | None:
     """Passes with the first way to look at the images, then the others if they are sharper.
 
-    All but the last go over some of the tiles; with `or_header` they also start from the header,
-    and the start that more patches agree with more closely is taken.
+    Where the first way shows nothing, the second is tried.  All passes but the last go over some of
+    the tiles, if those are enough; with `or_header` they also start from the header, unless nearly
+    all patches agree from the other start, and the start that more patches agree with more closely
+    is taken.
     """
     threads = part.pair.threads
     some = tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
     starts = [matrix, IDENTITY] if or_header else [matrix]
     passes = _PASSES_FROM_AFAR if or_header else _PASSES
     near: Refinement | None = None
+    others = looks[1:]
     tries = [(look, where) for look in looks[:2] for where in (some, tiles)]
     for look, where in tries if some is not tiles else tries[1::2]:
         for start in starts:
             found = _approach(part, where, start, options, look, passes)
-            if found is not None and (near is None or _scatter(found) < _scatter(near)):
-                near = found
+            if found is not None and (near is None or _preference(found) < _preference(near)):
+                near, others = found, looks[looks.index(look) + 1 :]
             if near is not None and _is_calm(near.dense):
                 break  # no other start could please more patches
         if near is not None:
@@ -218,7 +231,7 @@ def _passes(
     if near is None:
         return None
     if not _is_calm(near.dense):
-        near = _sharpest(part, near, looks[1:], options, threads)
+        near = _sharpest(part, near, others, options, threads)
     tone = fit_tone(part, tiles, near.matrix, near.tuning.sigma, threads)
     tuning = replace(near.tuning, tone=tone)
     options = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
@@ -269,7 +282,8 @@ def _sharpest(
         dense = match_pass(part, plain.tiles, best.matrix, tuning, options, threads)
         if not _is_sharper(part, dense, best.dense, 1.0 if changed else _CLEARLY):
             break
-        if plain.tuning.high_pass and _moved(part, dense, best.dense):
+        haze = plain.tuning.high_pass and not plain.tuning.local_tone
+        if haze and _moved(part, dense, best.dense):
             break  # more certain of another place is no gain where clouds are about
         assert dense.estimate is not None
         matrix = dense.estimate.transformation.matrix
@@ -282,13 +296,15 @@ def _moved(part: Roles, one: Dense, other: Dense) -> bool:
 
 
 def _is_sharper(part: Roles, one: Dense, other: Dense, factor: float) -> bool:
-    """True when a pass is more certain, by a factor, without losing many patches."""
+    """True when a pass is more certain, by a factor, without losing many patches.
+
+    One of enough patches for an affine is, whatever the factor, when the other's are too few.
+    """
     if one.estimate is None or other.estimate is None:
         return one.estimate is not None
+    if _is_shift(one) != _is_shift(other):  # a shift is more certain, but of few patches
+        return _is_shift(other)
     kept = [int((dense.status == Status.KEPT).sum()) for dense in (one, other)]
-    models = [dense.estimate.transformation.model for dense in (one, other) if dense.estimate]
-    if models[0] != models[1]:  # a shift alone is more certain, but only few patches speak for it
-        return models[1] == "shift"
     sigma = _difference(part, one, other)[1]
     return kept[0] >= _SHARPER_SHARE * kept[1] and sigma[0] < factor * sigma[1]
 

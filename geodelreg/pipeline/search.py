@@ -52,7 +52,7 @@ _CALM_SHARE = 0.8
 _CHANCE_LOG_NFA = -2.0
 SURE_LOG_NFA = -12.0
 _VISIBLE_BANDS = 3
-_TOGETHER_PX = 500_000  # a scale space takes some 230 bytes a pixel
+_TOGETHER_PX = 520_000  # a scale space takes some 230 bytes a pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +186,7 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     found: list[Hypothesis] = []
     views = _views(images.source)
     first = next(views)
+    keypoints: Keypoints | None
     reference, keypoints = _detect_both(pair, images.scope, images.reference, first)
     bright = bright_mask(images.reference)
     dark: Keypoints | None = None
@@ -295,7 +296,7 @@ def _mirrored(pair: Pair) -> bool:
 
 def _detect_both(
     pair: Pair, scope: Scope, reference: Band, source: Band
-) -> tuple[Keypoints, Keypoints | None]:
+) -> tuple[Keypoints, Keypoints]:
     """Keypoints of two images, at once where their scale spaces are small."""
     small = reference.data.size + source.data.size <= _TOGETHER_PX
 

@@ -190,20 +190,17 @@ def conclude(
     start = perf_counter()
     pair, estimate = part.pair, fitted.selection.estimate
     matrix = estimate.transformation.matrix
-    threads = pair.threads
 
     def overlaid() -> tuple[Accuracy, float]:
         before, after, wide = _overlays(part, hypothesis, refined, matrix)
         accuracy = measure(part, fitted.points, fitted.selection, before, after)
         return accuracy, rival_correlation(wide)
 
-    # the tiles still hold the last pass's surfaces, which all of this shares
+    # where MS is coarser, the tiles still hold the last pass's surfaces for all of this to share
     where = (part, refined.tiles, matrix, refined.tuning, refined.size)
-    with ThreadPoolExecutor(1) as aside:
-        whole = aside.submit(overlaid)
-        if threads == 1:
-            whole.result()
-        apart = bands_apart(*where, threads)
+    with ThreadPoolExecutor(pair.threads) as pool:
+        whole = pool.submit(overlaid)
+        apart = bands_apart(*where, pool)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)

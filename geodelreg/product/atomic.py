@@ -15,6 +15,7 @@ import json
 import logging
 import os
 import shutil
+import stat
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -198,9 +199,10 @@ def _acquire(folder: Path, target: Path) -> int:
     while True:
         try:
             folder.mkdir()
-        except FileExistsError:  # by now, its owner may have removed it
-            if os.path.lexists(folder) and not folder.is_dir():
-                raise
+        except FileExistsError:
+            with suppress(FileNotFoundError):  # by now, its owner may have removed it
+                if not stat.S_ISDIR(folder.lstat().st_mode):
+                    raise
         try:
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
         except FileNotFoundError:  # the previous owner has just removed the folder

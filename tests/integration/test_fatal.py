@@ -91,6 +91,23 @@ def test_many_bits_without_subsampling(tmp_path: Path) -> None:
         read(path)
 
 
+@pytest.mark.parametrize("signed", [8, 9])
+def test_numbers_may_be_signed(tmp_path: Path, signed: int) -> None:
+    """libtiff takes them, so a sound file with them is sound, and a deadly one deadly."""
+    path = make_tiff(tmp_path / "ms.tif", "jpeg")
+    data = bytearray(path.read_bytes())
+    tiff = parse(bytes(data))
+    assert tiff is not None
+    for slot in tiff.slots:
+        if slot.tag in (PHOTOMETRIC, SAMPLES):
+            struct.pack_into(tiff.order + "H", data, slot.at + 2, signed)
+    path.write_bytes(data)
+    check_survivable(path)
+    patch(path, SAMPLES, 1)
+    with pytest.raises(RasterUnreadableError, match="contradicts itself"):
+        check_survivable(path)
+
+
 def test_overviews_beside_it(tmp_path: Path) -> None:
     layout: dict[str, Any] = {"count": 1, "dtype": "uint8", "overviews": "external"}
     path = make_tiff(tmp_path / "ms.tif", shape=(600, 600), **layout)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from affine import Affine
 from pyproj import CRS, Transformer
 from pyproj.transformer import TransformerGroup
 
+import geodelreg.geo.crs
 from geodelreg.errors import CrsTransformError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, header_mapping, linearise, map_points
@@ -137,3 +140,24 @@ def test_header_mapping_between_zones_is_curved_and_exact() -> None:
     step = np.array([3.0, -2.0])
     there = mapping.forward(np.array([1000.0, 1000.0]) + step)
     assert local[:, :2] @ step + local[:, 2] == pytest.approx(there, abs=1e-3)
+
+
+def test_one_thread_at_a_time_asks_a_transformation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyproj makes those of a `TransformerGroup` for one thread each."""
+    busy: list[int] = []
+    most: list[int] = []
+
+    class Counting:
+        def transform(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            busy.append(1)
+            most.append(len(busy))
+            time.sleep(0.002)
+            busy.pop()
+            return x, y
+
+    operation = (Counting(), geodelreg.geo.crs.CrsOperation())
+    monkeypatch.setattr(geodelreg.geo.crs, "_operation", lambda *_: operation)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: map_points(POINTS, UTM17, UTM18), range(20)))
+    assert len(most) == 20
+    assert max(most) == 1

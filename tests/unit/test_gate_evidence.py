@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,7 +195,8 @@ def two_bands(parallax_px: float) -> float:
     pair = make_pair(ms, ArrayReader((Band(ground, valid, grid),)), AlignOptions())
     part = roles(pair)
     tiles = read_tiles(part, [Window(0, 0, 200, 200)], IDENTITY, 1)
-    return bands_apart(part, tiles, IDENTITY, Tuning(0.5, single_band(2, 0)), 20, 1)
+    with ThreadPoolExecutor(2) as pool:
+        return bands_apart(part, tiles, IDENTITY, Tuning(0.5, single_band(2, 0)), 20, pool)
 
 
 def test_bands_of_clouds_are_apart() -> None:

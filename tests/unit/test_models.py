@@ -129,6 +129,25 @@ def test_sigma_is_of_the_size_of_the_error_with_few_points(model: str) -> None:
     assert 0.8 < np.sqrt(np.mean(at**2)) < 1.3
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_common_variance_makes_the_median_distance_that_of_chi_square(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(9, 300))
+    covariance = np.tile(np.diag([0.01, 0.03]), (count, 1, 1)) * rng.lognormal(0, 1, (count, 1, 1))
+    residual = rng.standard_t(2, (count, 2)) * rng.uniform(0.01, 30)
+    extra = common_variance(residual, covariance)
+    inverse = np.linalg.inv(covariance + extra * np.eye(2))
+    median = float(np.median(np.einsum("ni,nij,nj->n", residual, inverse, residual)))
+    if extra:
+        assert median == pytest.approx(2 * np.log(2), rel=2e-4)
+    else:
+        assert median <= 2 * np.log(2)
+
+
+def test_points_without_any_error_leave_no_variance_over() -> None:
+    assert common_variance(np.zeros((9, 2)), np.zeros((9, 2, 2))) == 0.0
+
+
 def test_common_variance_is_what_the_covariances_leave_over() -> None:
     rng = np.random.default_rng(5)
     covariance = np.tile(np.diag([0.01, 0.03]), (5000, 1, 1)) * rng.uniform(0.5, 2, (5000, 1, 1))

@@ -9,9 +9,17 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy import ndimage
 
+from geodelreg.fit.estimate import Observations
 from geodelreg.fit.models import IDENTITY
+from geodelreg.image.synthetic_pan import single_band
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.refinement import refine_densely
+from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, agreement
+from geodelreg.pipeline.refinement import (
+    Refinement,
+    _is_shift,
+    _preference,
+    refine_densely,
+)
 from geodelreg.pipeline.search import Hypothesis, read_working_pair, scopes
 from geodelreg.pipeline.state import make_pair
 from geodelreg.pipeline.tiles import roles
@@ -46,3 +54,27 @@ def test_patches_match_where_every_field_changed_in_its_own_way(seed: int) -> No
     assert refined is not None
     assert (refined.dense.status == Status.KEPT).sum() >= 12
     np.testing.assert_allclose(refined.matrix[:, 2], -shift, atol=0.15)
+
+
+def refinement(count: int, noise_px: float) -> Refinement:
+    """Of so many patches that agree to within the noise."""
+    rng = np.random.default_rng(count)
+    grid = Grid(Affine(2.0, 0.0, 5e5, 0.0, -2.0, 1e6), (SIDE, SIDE), CRS.from_epsg(32616).to_wkt())
+    band = Band(np.zeros(grid.shape, np.float32), np.ones(grid.shape, bool), grid)
+    pair = make_pair(ArrayReader((band,)), ArrayReader((band,)), AlignOptions())
+    source = rng.uniform(0, SIDE, (count, 2))
+    target = source + rng.normal(0, noise_px, (count, 2))
+    covariance = np.tile(np.eye(2) * noise_px**2, (count, 1, 1))
+    points, status = Observations(source, target, covariance), np.zeros(count, np.uint8)
+    status, estimate = agreement(roles(pair), points, status, IDENTITY)
+    assert estimate is not None
+    dense = Dense(_concatenate([]), points, status, estimate)
+    return Refinement([], Tuning(0.5, single_band(1, 0)), dense, IDENTITY, 20)
+
+
+def test_a_shift_of_few_patches_is_not_preferred_to_an_affine_of_many() -> None:
+    few, many = refinement(5, 0.02), refinement(30, 0.02)
+    assert _is_shift(few.dense)
+    assert not _is_shift(many.dense)
+    assert _preference(many) < _preference(few)
+    assert _preference(refinement(60, 0.02)) < _preference(many)
