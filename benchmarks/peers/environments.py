@@ -12,6 +12,7 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 ROOT = Path(__file__).parents[2]
+OWN = "geodelreg"
 ADAPTERS = Path(__file__).parent / "adapters"
 BUILD_TIMEOUT_S = 1200.0
 RASTERS = ("rasterio>=1.4", "pyproj>=3.6", "numpy")

@@ -21,6 +21,7 @@ from affine import Affine
 
 from benchmarks.peers.environments import (
     ADAPTERS,
+    OWN,
     PEERS,
     PeerUnavailableError,
     environment,
@@ -30,7 +31,6 @@ from benchmarks.peers.environments import (
 from benchmarks.report import machine
 from benchmarks.scenes.truth import Truth, grid_rmse
 
-OWN = "geodelreg"
 CACHE = Path(__file__).parents[1] / ".cache"
 QUICK_SCENES = ("A", "C", "G")
 

@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks.peers.run import OWN
+from benchmarks.peers.environments import OWN
 from benchmarks.report import replace_section
 
 FAILED_PX = 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.scale.run import IN_PLACE, OVERVIEWS, PEAK_LIMIT_MB, PLAIN, STRIPED, Row
+from benchmarks.scale.row import IN_PLACE, OVERVIEWS, PEAK_LIMIT_MB, PLAIN, STRIPED, Row
 
 MARKERS = {OVERVIEWS: "s", STRIPED: "D"}
 

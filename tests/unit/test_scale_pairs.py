@@ -10,7 +10,8 @@ from affine import Affine
 from pyproj import CRS
 
 from benchmarks.scale.pairs import EndlessGround, integration_axis, pair_truth
-from benchmarks.scale.run import PLAIN, Row, growth, table
+from benchmarks.scale.row import PLAIN, Row
+from benchmarks.scale.run import growth, table
 from benchmarks.scenes.imagery import Imagery
 from benchmarks.scenes.truth import grid_rmse
 

@@ -15,8 +15,8 @@ from affine import Affine
 from pyproj import CRS
 
 from benchmarks.peers import table
-from benchmarks.peers.environments import Peer, PeerUnavailableError, environment
-from benchmarks.peers.run import OWN, Result, Tool, measured, read_transform, run_tool
+from benchmarks.peers.environments import OWN, Peer, PeerUnavailableError, environment
+from benchmarks.peers.run import Result, Tool, measured, read_transform, run_tool
 from benchmarks.report import replace_section
 from benchmarks.scenes.make import write_raster
 from benchmarks.scenes.truth import Truth
