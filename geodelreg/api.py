@@ -238,8 +238,6 @@ def _examine(
 
 def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
     masks = mask_uses(rasters.ms, rasters.pan)
-    units = (pair.source.grid.unit_m, pair.reference.grid.unit_m)
-    through_proj = pair.mapping.matrix is None or None in units or bool(masks)
     return Alignment(
         source=pair.source.grid,
         reference=pair.reference.grid,
@@ -254,7 +252,7 @@ def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
         warnings=solution.warnings,
         crs_operation=pair.mapping.operation.description,
         options=pair.options,
-        versions=versions(with_proj=through_proj),
+        versions=versions(with_proj=pair.through_proj or bool(masks)),
         timings_s=solution.timings_s,
         masks=masks,
     )
@@ -316,9 +314,11 @@ def write_in_place(alignment: Alignment) -> list[str]:
     UnsafeInPlaceError, FileLockedError, OutputUnwritableError
         The file is then as it was.
     """
+    from geodelreg.product.atomic import tidy
     from geodelreg.product.inplace import edit_in_place
 
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
+        tidy(map(Path, alignment.source_paths))
         return []
     tags = provenance_tags(alignment)
     notes: list[str] = []

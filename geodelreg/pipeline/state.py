@@ -67,6 +67,14 @@ class Pair:
         return float(np.sqrt(self.source_area_ratio))
 
     @property
+    def through_proj(self) -> bool:
+        """True when coordinates, or sizes of pixels, come from PROJ."""
+        return self.mapping.matrix is None or None in (
+            self.source.grid.unit_m,
+            self.reference.grid.unit_m,
+        )
+
+    @property
     def threads(self) -> int:
         """Threads to use."""
         return self.options.threads or os.cpu_count() or 1

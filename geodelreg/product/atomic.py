@@ -124,6 +124,14 @@ def staged(target: Path, *, overwrite: bool, stale: Iterable[Path] = ()) -> Iter
             raise unwritable(target, error) from error
 
 
+def tidy(targets: Iterable[Path]) -> None:
+    """Finish or remove what a killed process left beside targets that are not to be written now."""
+    for target in targets:
+        if os.path.lexists(_private_folder(Path(os.path.realpath(target)))):
+            with suppress(OutputUnwritableError, FileLockedError), exclusive(target):
+                pass
+
+
 @contextmanager
 def exclusive(target: Path) -> Iterator[Path]:
     """Hold the lock of `target`: yield its private folder, which is removed at the end.

@@ -23,6 +23,7 @@ import rasterio
 import tifffile
 from affine import Affine
 
+from geodelreg.api import write_in_place
 from geodelreg.errors import (
     FileLockedError,
     OutputUnwritableError,
@@ -30,7 +31,7 @@ from geodelreg.errors import (
     UnsafeInPlaceError,
 )
 from geodelreg.product.inplace import edit_in_place, revert
-from geodelreg.types import Correction
+from geodelreg.types import Correction, Outcome, Verdict
 from tests.integration.faults import (
     contents,
     names,
@@ -55,6 +56,7 @@ from tests.integration.raster_samples import (
     make_tiff,
     transform_of,
 )
+from tests.unit.alignment_sample import alignment
 
 UNDO = ".geodelreg-undo.json"
 
@@ -507,3 +509,15 @@ def test_degenerate_correction_never_reaches_the_file(tmp_path: Path) -> None:
     with pytest.raises(OutputUnwritableError, match="georeferencing"):
         edit_in_place(raster, nowhere, GCPS, TAGS)
     assert contents(tmp_path) == before
+
+
+def test_what_a_killed_run_left_goes_even_when_there_is_nothing_to_edit(tmp_path: Path) -> None:
+    """Killed after its last step, a run leaves its lock; the next one finds the file aligned."""
+    path = make_tiff(tmp_path / "ms.tif")
+    before, private = contents(tmp_path), tmp_path / ".ms.tif.geodelreg"
+    private.mkdir()
+    (private / "lock").touch()
+    verdict = Verdict(Outcome.ALREADY_ALIGNED)
+    assert write_in_place(alignment(source_paths=(str(path),), verdict=verdict)) == []
+    assert contents(tmp_path) == before
+    assert not private.exists()
