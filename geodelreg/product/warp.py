@@ -110,9 +110,8 @@ def write_warped(
             creation = user_creation(options) if driver == "GTiff" else {}
             draft = out
             if driver != "GTiff":
-                draft = (
-                    out.parent.parent / "warped" / f"{source.stem}.tif"
-                )  # which may tell of flags
+                # the name may tell of flags
+                draft = out.parent.parent / "warped" / f"{source.stem}.tif"
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
                 notes = _warp(source, draft, content, grid, creation, options)
