@@ -27,6 +27,7 @@ _SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
 _TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
 _SIGMA_PIXELS = 300_000
+_SIGMA_SAMPLES = 8_000
 _MIXED_SIGMA = 0.03
 _GROUP_PATCHES = 100
 _CORE_SIGMAS = 1.5
@@ -169,13 +170,14 @@ def fit_sigma(
     """Low-pass with which the finer image resembles the coarser one most, in template pixels."""
     count = max(_SIGMA_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
+    per_tile = max(_SIGMA_SAMPLES // len(chosen), 64)
 
     def unexplained(sigma: float) -> float:
         total = 0.0
         for tile in chosen:
             images = Tile(tile.template, tile.surface)
             (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
-            xy, take = _lattice(template, part, 4000)
+            xy, take = _lattice(template, part, per_tile)
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
             good = usable[:, 0] & template.valid[take]
             total += _unexplained(values[good, 0], template.data[take][good])
