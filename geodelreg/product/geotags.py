@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from affine import Affine
 
-from geodelreg.product.tiff import ASCII, DOUBLE, Directory, Entry, Layout, TiffFile
+from geodelreg.tiff import ASCII, DOUBLE, Directory, Entry, Layout, TiffFile
 from geodelreg.types import Gcp
 
 PIXEL_SCALE, TIE_POINTS, TRANSFORMATION = 33550, 33922, 34264

@@ -19,8 +19,8 @@ from geodelreg.product.copying import open_source
 from geodelreg.product.environment import gdal_failures, gdal_session
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import output_driver, rewrite
-from geodelreg.product.tiff import is_tiff
 from geodelreg.product.tiffwrite import copy_with_header, is_cog
+from geodelreg.tiff import is_tiff
 from geodelreg.types import Correction, Gcp
 
 _EXACT_PX = 1e-6

@@ -14,7 +14,7 @@ from affine import Affine
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.product import geotags
 from geodelreg.product.environment import gdal_failures
-from geodelreg.product.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
+from geodelreg.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
 from geodelreg.types import Correction, Gcp
 
 Domains = Mapping[str, Mapping[str, str]]

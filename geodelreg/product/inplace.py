@@ -25,9 +25,9 @@ from geodelreg.product.atomic import exclusive, unwritable
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Georeference, Provenance, corrected_entries
-from geodelreg.product.tiff import TiffFile, is_tiff
 from geodelreg.product.tiffwrite import appended_directory, fits, new_pointer
 from geodelreg.product.undo import Edit, SidecarChange, State
+from geodelreg.tiff import TiffFile, is_tiff
 from geodelreg.types import Correction, Gcp
 
 logger = logging.getLogger(__name__)

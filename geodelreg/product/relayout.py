@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from geodelreg.errors import LossyOutputError
 from geodelreg.product.atomic import write_fully
 from geodelreg.product.copying import copy_range
-from geodelreg.product.tiff import (
+from geodelreg.tiff import (
     CLASSIC_LIMIT,
     LONG,
     LONG8,

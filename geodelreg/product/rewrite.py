@@ -16,9 +16,9 @@ from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.header import Provenance, merged_domains
-from geodelreg.product.tiff import is_tiff
 from geodelreg.product.tiffwrite import edit_private, is_tiled
 from geodelreg.product.view import corrected_view
+from geodelreg.tiff import is_tiff
 
 logger = logging.getLogger(__name__)
 

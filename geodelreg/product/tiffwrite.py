@@ -10,7 +10,7 @@ from geodelreg.product import relayout
 from geodelreg.product.atomic import write_fully
 from geodelreg.product.copying import Unchanged, copy_range, open_source
 from geodelreg.product.header import Georeference, Metadata, Provenance, corrected_entries
-from geodelreg.product.tiff import (
+from geodelreg.tiff import (
     CLASSIC_LIMIT,
     Entry,
     TiffFile,

@@ -108,6 +108,28 @@ def test_numbers_may_be_signed(tmp_path: Path, signed: int) -> None:
         check_survivable(path)
 
 
+def cut_off_after_entries(path: Path) -> None:
+    """Move the main directory to the end of the file, without the offset that ends it."""
+    data = bytearray(path.read_bytes())
+    tiff = parse(bytes(data))
+    assert tiff is not None
+    struct.pack_into(tiff.pointer, data, tiff.links[0], len(data))
+    path.write_bytes(data + data[tiff.offsets[0] : tiff.links[1]])
+
+
+@pytest.mark.parametrize("bigtiff", ["no", "yes"])
+def test_cut_off_after_the_last_entry(tmp_path: Path, bigtiff: str) -> None:
+    """libtiff opens such a file, with a warning."""
+    sound = make_tiff(tmp_path / "sound.tif", "jpeg", bigtiff=bigtiff)
+    deadly = make_tiff(tmp_path / "deadly.tif", "jpeg", bigtiff=bigtiff)
+    patch(deadly, SAMPLES, 1)
+    cut_off_after_entries(sound)
+    cut_off_after_entries(deadly)
+    read(sound)
+    with pytest.raises(RasterUnreadableError, match="contradicts itself"):
+        read(deadly)
+
+
 def test_overviews_beside_it(tmp_path: Path) -> None:
     layout: dict[str, Any] = {"count": 1, "dtype": "uint8", "overviews": "external"}
     path = make_tiff(tmp_path / "ms.tif", shape=(600, 600), **layout)

@@ -15,7 +15,7 @@ from geodelreg.errors import GeodelregError, RasterUnreadableError
 from geodelreg.options import WriteOptions
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place, revert
-from geodelreg.product.tiff import TiffFile
+from geodelreg.tiff import TiffFile
 from geodelreg.types import Correction
 from tests.integration.faults import names
 from tests.integration.raster_samples import (

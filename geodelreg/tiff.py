@@ -25,8 +25,11 @@ _TYPE_BYTES = {
     **dict.fromkeys((4, 9, 11, 13), 4),
     **dict.fromkeys((5, 10, 12, 16, 17, 18), 8),
 }
-_CODES = {SHORT: "H", LONG: "I", DOUBLE: "d", LONG8: "Q"}
-_MAX_ENTRIES = 65535
+_INTEGER_CODES = {1: "B", SHORT: "H", LONG: "I", 6: "b", 8: "h", 9: "i", LONG8: "Q", 17: "q"}
+_CODES = {**_INTEGER_CODES, DOUBLE: "d"}
+_MAX_ENTRIES = 4096
+"""Of a directory; libtiff refuses more."""
+
 _MAX_DIRECTORY_BYTES = 2**30
 """Of all directories of a file with their values; a broken file may announce any length."""
 
@@ -58,6 +61,11 @@ class Layout:
     def pointer_at(self) -> int:
         """Where the file keeps the offset of its first directory."""
         return 8 if self.big else 4
+
+    @property
+    def count_bytes(self) -> int:
+        """Width of a number of directory entries."""
+        return 8 if self.big else 2
 
     @property
     def header_bytes(self) -> int:
@@ -136,11 +144,7 @@ class Directory:
 
     def byte_length(self, layout: Layout) -> int:
         """Length of the directory itself, without the values outside it."""
-        return (
-            (8 if layout.big else 2)
-            + len(self.entries) * layout.entry_bytes
-            + (layout.offset_bytes)
-        )
+        return layout.count_bytes + len(self.entries) * layout.entry_bytes + layout.offset_bytes
 
 
 class TiffFile:
@@ -189,20 +193,22 @@ class TiffFile:
             length -= len(part)
         return b"".join(parts)
 
-    def directory(self, offset: int) -> Directory:
-        """Read one directory."""
+    def entries(self, offset: int) -> tuple[Entry, ...]:
+        """Entries of a directory, even if the file ends before the offset of the next."""
         layout = self.layout
-        head = 8 if layout.big else 2
-        (count,) = struct.unpack(
-            layout.order + ("Q" if layout.big else "H"), self.read(offset, head)
-        )
+        head = self.read(offset, layout.count_bytes)
+        (count,) = struct.unpack(layout.order + ("Q" if layout.big else "H"), head)
         if not 0 < count <= _MAX_ENTRIES:
             raise self.broken(f"its TIFF directory has {count} entries")
-        body = self.read(offset + head, count * layout.entry_bytes + layout.offset_bytes)
+        body = self.read(offset + layout.count_bytes, count * layout.entry_bytes)
         code = layout.order + ("HHQ8s" if layout.big else "HHI4s")
-        entries = struct.iter_unpack(code, body[: count * layout.entry_bytes])
-        following = self._offset(body[count * layout.entry_bytes :])
-        return Directory(offset, tuple(Entry(*fields) for fields in entries), following)
+        return tuple(Entry(*fields) for fields in struct.iter_unpack(code, body))
+
+    def directory(self, offset: int) -> Directory:
+        """Read one directory."""
+        layout, entries = self.layout, self.entries(offset)
+        end = offset + layout.count_bytes + len(entries) * layout.entry_bytes
+        return Directory(offset, entries, self._offset(self.read(end, layout.offset_bytes)))
 
     def first_directory(self) -> Directory:
         """Directory of the main image."""
@@ -236,20 +242,29 @@ class TiffFile:
 
     def value(self, entry: Entry | None) -> bytes:
         """Raw value of an entry, b"" for None."""
-        if entry is None:
-            return b""
-        if entry.data is not None:
-            return entry.data
-        if self.is_outside(entry):
-            return self.read(self.place(entry), entry.size)
-        return entry.field[: entry.size]
+        return b"" if entry is None else self._start(entry, entry.size)
 
     def numbers(self, entry: Entry | None) -> tuple[float, ...]:
-        """Value of a SHORT, LONG, LONG8 or DOUBLE entry; () for None or another type."""
+        """Value of an integer or DOUBLE entry; () for None or another type."""
         if entry is None or entry.type not in _CODES:
             return ()
-        raw = self.value(entry)
-        return struct.unpack(f"{self.layout.order}{entry.count}{_CODES[entry.type]}", raw)
+        code = f"{self.layout.order}{entry.count}{_CODES[entry.type]}"
+        return struct.unpack(code, self.value(entry))
+
+    def first_integer(self, entry: Entry | None) -> int | None:
+        """First number of an integer entry; None for no number, for None or another type."""
+        if entry is None or not entry.count or entry.type not in _INTEGER_CODES:
+            return None
+        code = self.layout.order + _INTEGER_CODES[entry.type]
+        return int(struct.unpack(code, self._start(entry, _TYPE_BYTES[entry.type]))[0])
+
+    def _start(self, entry: Entry, length: int) -> bytes:
+        """First bytes of a raw value."""
+        if entry.data is not None:
+            return entry.data[:length]
+        if self.is_outside(entry):
+            return self.read(self.place(entry), length)
+        return entry.field[:length]
 
     def integers(self, entry: Entry | None) -> NDArray[np.uint64]:
         """(count,) uint64 value of a SHORT, LONG or LONG8 entry; empty for None."""
