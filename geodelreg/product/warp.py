@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -205,7 +205,7 @@ def _warp(
         profile |= {key.lower(): value for key, value in creation.items()}
         with (
             _warped(view, grid, validity, resampling) as warped,
-            _warped(view, grid, validity, "nearest") as nearest,
+            _warped(view, grid, validity, "nearest") if flags else nullcontext() as nearest,
             rasterio.open(out, "w", **profile) as dataset,
         ):
             _annotate(view, dataset)
