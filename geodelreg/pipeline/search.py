@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import chain
 from time import perf_counter
 
 import numpy as np
@@ -184,27 +183,21 @@ def keypoint_hypotheses(pair: Pair, images: WorkingPair) -> Iterator[Hypothesis]
     Stops after the first way that is beyond doubt; a weak one is followed by those of other bands.
     """
     found: list[Hypothesis] = []
-    views = _views(images.source)
-    first = next(views)
-    keypoints: Keypoints | None
-    reference, keypoints = _detect_both(pair, images.scope, images.reference, first)
     bright = bright_mask(images.reference)
+    reference: Keypoints | None = None
     dark: Keypoints | None = None
-    for band in chain([first], views):
-        everywhere = _match_view(pair, images, band, reference, keypoints)
-        keypoints = None
+    for band in _views(images.source):
+        source, reference = _detect_both(pair, images.scope, band, images.reference, reference)
+        everywhere = _match_view(pair, images, source, reference)
         mine = None if bright is None else bright_mask(band)
         if mine is None or bright is None:
             agreed = [] if everywhere is None else [everywhere]
         else:
             ground = None
             if everywhere is None or not _is_calm(everywhere):
-                hidden = _hidden(band, mine)
-                if dark is None:
-                    scene = _hidden(images.reference, bright)
-                    dark, keypoints = _detect_both(pair, images.scope, scene, hidden)
-                ground = _match_view(pair, images, hidden, dark, keypoints)
-                keypoints = None
+                hidden, scene = _hidden(band, mine), _hidden(images.reference, bright)
+                source, dark = _detect_both(pair, images.scope, hidden, scene, dark)
+                ground = _match_view(pair, images, source, dark)
             doubt = _in_doubt(pair, ground, everywhere)
             agreed = [replace(hypothesis, bright=(mine, bright)) for hypothesis in doubt]
         if any(hypothesis.log_nfa < SURE_LOG_NFA for hypothesis in agreed):
@@ -237,14 +230,8 @@ def _hidden(band: Band, mask: BoolArray) -> Band:
 
 
 def _match_view(
-    pair: Pair,
-    images: WorkingPair,
-    band: Band,
-    reference: Keypoints,
-    source: Keypoints | None = None,
+    pair: Pair, images: WorkingPair, source: Keypoints, reference: Keypoints
 ) -> Hypothesis | None:
-    if source is None:
-        source = _detect(band, _mirrored(pair), pair, images.scope)
     matched = _one_to_one(pair, source, reference)
     if matched is None:
         return None
@@ -295,17 +282,23 @@ def _mirrored(pair: Pair) -> bool:
 
 
 def _detect_both(
-    pair: Pair, scope: Scope, reference: Band, source: Band
+    pair: Pair, scope: Scope, source: Band, reference: Band, known: Keypoints | None
 ) -> tuple[Keypoints, Keypoints]:
-    """Keypoints of two images, at once where their scale spaces are small."""
+    """Keypoints of two images, at once where their scale spaces are small.
+
+    Those of the reference are detected unless they are known.
+    """
+    flip = _mirrored(pair)
+    if known is not None:
+        return _detect(source, flip, pair, scope), known
     small = reference.data.size + source.data.size <= _TOGETHER_PX
 
     def mine(image: Band, flip: bool) -> Keypoints:
         return _detect(image, flip, pair, scope)
 
     with ThreadPoolExecutor(2 if small and pair.threads > 1 else 1) as pool:
-        found = list(pool.map(mine, [reference, source], [False, _mirrored(pair)]))
-    return found[0], found[1]
+        found = list(pool.map(mine, [reference, source], [False, flip]))
+    return found[1], found[0]
 
 
 def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
