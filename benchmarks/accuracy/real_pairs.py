@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from affine import Affine
@@ -17,6 +16,7 @@ from benchmarks.accuracy.measure import (
     measure_offsets,
     read_raster,
 )
+from benchmarks.records import save
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,5 +181,5 @@ def run(args: argparse.Namespace) -> int:
         rows.append(align_pair(pair, args.data))
     print(table(rows))
     if args.out:
-        args.out.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
+        save(args.out, rows)
     return 0

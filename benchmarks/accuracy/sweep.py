@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import math
 import tempfile
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from affine import Affine
 
+from benchmarks.records import save
 from benchmarks.report import machine, replace_section
 from benchmarks.scenes.imagery import Imagery, sample_imagery, sentinel2
 from benchmarks.scenes.make import HeaderError, SceneSpec, make_scene, write_scene
@@ -246,7 +246,7 @@ def run(args: argparse.Namespace) -> int:
     text = f"{summary(rows)}\n\n{table(rows)}"
     print(f"\n{text}")
     if args.out:
-        args.out.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
+        save(args.out, rows)
     if args.docs:
         heading = "## Sweep over rotation, shift, scale and GSD ratio"
         note = f"`python -m benchmarks sweep --data DIR --docs docs/benchmarks.md` ({machine()})."

@@ -20,12 +20,12 @@ from affine import Affine
 from benchmarks.gate.cases import Case, cases, is_there
 from benchmarks.gate.page import false_accept, figure, page
 from benchmarks.gate.pairs import make_pair
+from benchmarks.records import Row, resume
 from benchmarks.report import replace_section
 from benchmarks.scenes.make import write_scene
 from benchmarks.scenes.truth import Truth, grid_rmse
 
 log = logging.getLogger(__name__)
-Row = dict[str, Any]
 
 
 def run_case(case: Case, data: Path) -> Row:
@@ -97,24 +97,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def load(path: Path) -> list[Row]:
-    """Rows of an earlier run; a line cut short by a kill is left out."""
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            log.warning("%s: a line was cut short and is run again", path)
-    return rows
-
-
-def _tidy(path: Path, rows: list[Row]) -> None:
-    """Rewrite whole lines only, so that what is appended starts on a line of its own."""
-    text = "".join(json.dumps(row) + "\n" for row in rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks gate``."""
     parser.add_argument("--data", type=Path, required=True, help="folder with the real imagery")
@@ -141,8 +123,7 @@ def _wanted(args: argparse.Namespace) -> list[Case]:
 
 def run(args: argparse.Namespace) -> int:
     """Run what is missing of the pairs; 1 when any false accept is among them."""
-    rows = load(args.out)
-    _tidy(args.out, rows)
+    rows = resume(args.out)
     done = {row["name"] for row in rows}
     missing = [case for case in _wanted(args) if case.name not in done]
     stop = time.monotonic() + 60 * args.minutes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 log = logging.getLogger(__name__)
-ROOT = Path(__file__).parents[2]
 OWN = "geodelreg"
 ADAPTERS = Path(__file__).parent / "adapters"
 BUILD_TIMEOUT_S = 1200.0
@@ -137,13 +135,3 @@ def own_command(scene: Path, out: Path) -> list[str]:
         sys.executable, "-m", "geodelreg_cli", "align", str(scene / "ms.tif"),
         str(scene / "pan.tif"), "-o", str(out), "--quiet",
     ]  # fmt: skip
-
-
-def own_environment() -> dict[str, str]:
-    """Environment variables under which this checkout's geodelreg is found.
-
-    Its byte code is kept, as pip keeps that of an installed copy and of every peer.
-    """
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "cli")])
-    rest = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    return {**rest, "PYTHONPATH": paths}

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import math
 import os
 import shutil
-import signal
-import subprocess
 import tempfile
-import threading
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-from affine import Affine
 
 from benchmarks.peers.environments import (
     ADAPTERS,
@@ -26,8 +19,9 @@ from benchmarks.peers.environments import (
     PeerUnavailableError,
     environment,
     own_command,
-    own_environment,
 )
+from benchmarks.processes import measured, own_environment
+from benchmarks.records import read_transform
 from benchmarks.report import machine
 from benchmarks.scenes.truth import Truth, grid_rmse
 
@@ -78,60 +72,6 @@ class Tool:
             str(self.python), str(self.script), "--ms", str(scene / "ms.tif"),
             "--pan", str(scene / "pan.tif"), "--out", str(out), "--setting", self.setting,
         ]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Usage:
-    """What a process cost and how it ended."""
-
-    wall_s: float
-    cpu_s: float
-    peak_mb: float
-    status: int
-    last_line: str
-
-
-def measured(command: list[str], env: dict[str, str], timeout_s: float, folder: Path) -> Usage:
-    """Run a command as a session of its own and read its resources from the kernel.
-
-    The kernel counts a child's peak from the fork on, when it still is its parent: call this from a
-    process that is smaller than what it measures.
-    """
-    with (folder / "stderr.txt").open("w+b") as errors:
-        started = time.perf_counter()
-        process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=errors, env=env, cwd=folder,
-            start_new_session=True,
-        )  # fmt: skip
-        stop = threading.Timer(timeout_s, _kill_session, [process.pid])
-        stop.start()
-        _, status, usage = os.wait4(process.pid, 0)
-        wall = time.perf_counter() - started
-        stop.cancel()
-        process.returncode = os.waitstatus_to_exitcode(status)
-        errors.seek(0)
-        lines = errors.read().decode(errors="replace").strip().splitlines()
-    last = lines[-1].strip() if lines else ""
-    if wall >= timeout_s:
-        last = f"stopped after {timeout_s:g} s"
-    return Usage(
-        wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, process.returncode, last
-    )
-
-
-def _kill_session(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(pid, signal.SIGKILL)
-
-
-def read_transform(out: Path) -> Affine:
-    """Corrected geotransform of MS that a tool left."""
-    if out.suffix == ".json":
-        return Affine(*json.loads(out.read_text())["transform"])
-    import rasterio
-
-    with rasterio.open(out) as raster:
-        return Affine(*tuple(raster.transform)[:6])
 
 
 def run_tool(tool: Tool, scene: Path, timeout_s: float) -> Result:

@@ -21,12 +21,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
-from benchmarks.gate.run import load
+from benchmarks.records import Row, resume
 from benchmarks.report import replace_section
-
-Row = dict[str, Any]
 
 HANG_S = 30.0
 """Of CPU time, for the machine may be busy."""
@@ -232,9 +229,7 @@ def run(args: argparse.Namespace) -> int:
         return _one(args.case, args.keep)
     if args.out is None:
         raise SystemExit("--out FILE.jsonl is needed")
-    rows = load(args.out)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    rows = resume(args.out)
     done = {row["number"] for row in rows}
     missing = [number for number in range(args.count) if number not in done]
     with args.out.open("a", encoding="utf-8") as out:

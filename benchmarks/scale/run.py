@@ -13,8 +13,8 @@ from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
-from benchmarks.peers.environments import ROOT, own_environment
-from benchmarks.peers.run import Usage, measured, read_transform
+from benchmarks.processes import ROOT, Usage, measured, own_environment
+from benchmarks.records import read_transform
 from benchmarks.report import machine, replace_section
 from benchmarks.scale.row import (
     IN_PLACE,

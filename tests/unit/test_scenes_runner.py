@@ -16,7 +16,9 @@ from pyproj import CRS
 
 from benchmarks.peers import table
 from benchmarks.peers.environments import OWN, Peer, PeerUnavailableError, environment
-from benchmarks.peers.run import Result, Tool, measured, read_transform, run_tool
+from benchmarks.peers.run import Result, Tool, run_tool
+from benchmarks.processes import measured
+from benchmarks.records import read_transform
 from benchmarks.report import replace_section
 from benchmarks.scenes.make import write_raster
 from benchmarks.scenes.truth import Truth
@@ -88,7 +90,7 @@ def test_resources_are_those_of_the_child(tmp_path: Path) -> None:
     busy = "import time\nwhile time.process_time() < 0.4: pass"
     command = [sys.executable, "-c", f"{hungry}\n{busy}"]
     small = (  # the process that runs the tests may be larger than the child
-        "import dataclasses, json, pathlib; from benchmarks.peers.run import measured;"
+        "import dataclasses, json, pathlib; from benchmarks.processes import measured;"
         f"usage = measured({command!r}, {{}}, 60, pathlib.Path({str(tmp_path)!r}));"
         "print(json.dumps(dataclasses.asdict(usage)))"
     )
