@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.sweep import align_scene
+from benchmarks.accuracy.attempt import align_scene
 from benchmarks.report import machine, replace_section
 from benchmarks.scenes.ground import Ground
 from benchmarks.scenes.imagery import ImageryNotFoundError

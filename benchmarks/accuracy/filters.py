@@ -1,4 +1,4 @@
-"""How well mismatch filters tell right matches from wrong ones: ``python -m benchmarks filters``.
+"""How well mismatch filters tell right matches from wrong ones.
 
 Matches are drawn with known truth: uniformly spread points under a random similarity, optionally
 with a smooth distortion and with noise; a share of them is matched wrongly instead: anywhere, or
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.report import machine, replace_section
 from geodelreg.match.delaunay_filter import filter_matches, star_filter
 from geodelreg.match.zhang2013 import initial_status, reject_unshared
 from geodelreg.types import BoolArray, FloatArray, IntArray, Status
@@ -298,7 +298,7 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Arguments of ``python -m benchmarks filters``."""
     parser.add_argument("--count", type=int, nargs="+", default=[300, 1000], help="matches")
     parser.add_argument("--distortion", type=float, nargs="+", default=[0.0, 2.0], help="px")
     parser.add_argument("--noise", type=float, nargs="+", default=[0.3], help="px")
@@ -311,31 +311,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--docs", type=Path, help="page whose section is replaced, with its plot")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write the figures."""
     rows = [
         row
-        for count in arguments.count
-        for distortion in arguments.distortion
-        for noise in arguments.noise
-        for near in arguments.near
-        for share in arguments.share
-        for row in measure(Case(count, distortion, noise, share, near), arguments.repetitions)
+        for count in args.count
+        for distortion in args.distortion
+        for noise in args.noise
+        for near in args.near
+        for share in args.share
+        for row in measure(Case(count, distortion, noise, share, near), args.repetitions)
     ]
     text = f"{reach(rows)}\n\n{markdown(rows)}"
     print(text)
-    if arguments.docs:
-        from benchmarks.report import machine, replace_section
-
-        draw(rows, arguments.docs.parent / "images" / "filters.png")
-        note = f"Mean of {arguments.repetitions} drawings, median ms. {machine()}."
-        replace_section(arguments.docs, "filters", f"{text}\n\n{note}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+    if args.docs:
+        draw(rows, args.docs.parent / "images" / "filters.png")
+        note = f"Mean of {args.repetitions} drawings, median ms. {machine()}."
+        replace_section(args.docs, "filters", f"{text}\n\n{note}")
+    if args.json:
+        args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     return 0
-
-
-if __name__ == "__main__":
-    command = argparse.ArgumentParser(prog="python -m benchmarks filters", description=__doc__)
-    add_arguments(command)
-    sys.exit(run(command.parse_args()))

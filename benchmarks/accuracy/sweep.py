@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import math
 import tempfile
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from affine import Affine
 
+from benchmarks.accuracy.attempt import align_scene
 from benchmarks.records import save
 from benchmarks.report import machine, replace_section
 from benchmarks.scenes.imagery import Imagery, sample_imagery, sentinel2
 from benchmarks.scenes.make import HeaderError, SceneSpec, make_scene, write_scene
 from benchmarks.scenes.truth import grid_rmse
 
-log = logging.getLogger(__name__)
 LAND_CENTRE = (560.0, 760.0)
 LIMIT_PX = 0.1
 GOLDEN_ANGLE_DEG = 137.508
@@ -136,23 +134,6 @@ def sample_cases() -> dict[str, SceneSpec]:
 def worse_than_recorded(name: str, rmse_px: float) -> bool:
     """True when a sample scene is off by more than twice its recorded figure, or not aligned."""
     return not rmse_px <= WORSE * SAMPLE[name][2]
-
-
-def align_scene(folder: Path) -> tuple[str, str, Affine | None, float]:
-    """Align the two rasters of a folder; outcome, model, corrected geotransform, seconds."""
-    from geodelreg import align
-    from geodelreg.errors import GeodelregError
-
-    started = time.perf_counter()
-    try:
-        found = align(folder / "ms.tif", folder / "pan.tif")
-    except GeodelregError as error:
-        return type(error).__name__, "none", None, time.perf_counter() - started
-    except Exception as error:
-        log.exception("crashed")
-        return f"crash: {type(error).__name__}", "none", None, time.perf_counter() - started
-    seconds = time.perf_counter() - started
-    return found.verdict.outcome.value, found.correction.model, found.correction.corrected, seconds
 
 
 def run_case(spec: SceneSpec, imagery: Imagery) -> Row:
