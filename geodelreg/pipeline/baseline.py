@@ -42,9 +42,8 @@ def solve_baseline(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
     observations = Observations(points.source_px, target, covariance)
     estimate = least_squares(model, observations.take(kept), pair.frame())
     timings["match and fit"] = perf_counter() - start
-    part = roles(pair)
     matched = replace(hypothesis, matrix=estimate.transformation.matrix, counts={}, bright=None)
-    area = refine_densely(part, matched, timings)
+    area = refine_densely(roles(pair), matched, timings)
     if area is None:
         return None
     check = held_out(model, observations.take(kept), estimate)
@@ -58,7 +57,7 @@ def solve_baseline(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
         log_nfa(gap, float(height * width), 3, 3 * pair.pan_px_per_source_px)[0],
         _apart(pair, estimate, area),
     )
-    return conclude(part, matched, area, fitted, timings)
+    return conclude(matched, area, fitted, timings)
 
 
 def least_squares(model: str, points: Observations, frame: Frame) -> Estimate:

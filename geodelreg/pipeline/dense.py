@@ -24,8 +24,10 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_SIGMA = 0.5
 _SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
+_SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is out of focus
 _TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
+_CLEARLY = 0.9
 _SIGMA_PIXELS = 300_000
 _SIGMA_SAMPLES = 8_000
 _MIXED_SIGMA = 0.03
@@ -184,14 +186,26 @@ def fit_sigma(
         return total
 
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        unlike = list(pool.map(unexplained, _SIGMA_CANDIDATES))
-    best = int(np.argmin(unlike))
-    if best in (0, len(unlike) - 1):
-        return _SIGMA_CANDIDATES[best]
-    left, middle, right = unlike[best - 1 : best + 2]
-    bend = left - 2 * middle + right
-    offset = (left - right) / (2 * bend) if bend > 0 else 0.0
-    return _SIGMA_CANDIDATES[best] + offset * (_SIGMA_CANDIDATES[1] - _SIGMA_CANDIDATES[0])
+        unlike = dict(zip(_SIGMA_CANDIDATES, pool.map(unexplained, _SIGMA_CANDIDATES), strict=True))
+    usual = min(unlike.values())
+    for softer in _SOFTER:
+        if min(unlike, key=unlike.__getitem__) != max(unlike):
+            break
+        unlike[softer] = unexplained(softer)
+    if min(unlike.values()) > _CLEARLY * usual:  # changed ground is as like at any sharpness
+        unlike = {sigma: unlike[sigma] for sigma in _SIGMA_CANDIDATES}
+    return _lowest(unlike)
+
+
+def _lowest(values: dict[float, float]) -> float:
+    """Where the parabola through the lowest value and its neighbours is lowest."""
+    places = sorted(values)
+    best = min(range(len(places)), key=lambda i: values[places[i]])
+    if best in (0, len(places) - 1):
+        return places[best]
+    near = places[best - 1 : best + 2]
+    bend, slope, _ = np.polyfit(near, [values[place] for place in near], 2)
+    return float(np.clip(-slope / (2 * bend), near[0], near[2])) if bend > 0 else near[1]
 
 
 def _unexplained(one: Float32Array, other: Float32Array) -> float:
@@ -265,7 +279,7 @@ def agreement(
     status = status.copy()
     kept = np.flatnonzero(status == Status.KEPT)
     frame = part.pair.frame()
-    unit = 1.0 if part.ms_is_template() else part.surface_px_per_template_px
+    unit = part.step if part.ms_is_template() else part.surface_px_per_patch_px
     estimate = _fit_all(points.take(kept), matrix, frame)
     if estimate is not None and _is_mixed(estimate, unit):
         inliers = _rigid_core(points.take(kept), unit)

@@ -151,7 +151,7 @@ def bands_apart(
     Returns
     -------
     float
-        Coarser pixels at the centre of the MS raster, of the two bands that are furthest apart;
+        Pixels of a patch at the centre of the MS raster, of the two bands that are furthest apart;
         0 where fewer than two match as many patches as half of what the best one does.
     """
     pair = part.pair
@@ -180,7 +180,7 @@ def bands_apart(
         float(np.hypot(*(here - there))) - _SURE_SIGMAS * float(np.hypot(one, other))
         for (one, here), (other, there) in combinations(seen, 2)
     ]
-    return max([0.0, *apart]) * min(1.0, pair.pan_px_per_source_px)
+    return max([0.0, *apart]) * pair.pan_px_per_source_px / part.pan_px_per_patch_px
 
 
 def _spread(count: int, most: int) -> list[int]:

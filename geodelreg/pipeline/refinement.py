@@ -51,6 +51,7 @@ _CALM_SHARE = 0.9
 _CALM_SIGMA_PX = 0.02
 _SHARPER_SHARE = 0.6
 _MUCH_VISIBLE = 0.75
+_BLURRED_SIGMA = 0.85
 _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 
 
@@ -60,6 +61,8 @@ class Refinement:
 
     Attributes
     ----------
+    part : Roles
+        With the step that suits what the template really shows.
     tiles : list of Tile
     tuning : Tuning
     dense : Dense
@@ -67,13 +70,14 @@ class Refinement:
     matrix : (2, 3) float64
         MS pixels to MS header pixels.
     size : int
-        Side of a patch, template pixels.
+        Side of a patch, pixels of the tiles' template bands.
     dark_only : bool
         The tiles show no bright objects.
     without_bright : bool
         Bright objects were left out, because with them the patches agree on something else.
     """
 
+    part: Roles
     tiles: list[Tile]
     tuning: Tuning
     dense: Dense
@@ -82,24 +86,52 @@ class Refinement:
     dark_only: bool = False
     without_bright: bool = False
 
+    def is_blurred(self) -> bool:
+        """True when larger template pixels would show as much, and enough of them are left."""
+        return self.tuning.sigma > _BLURRED_SIGMA and self.part.step < self.part.largest_step
+
 
 def refine_densely(
     part: Roles, hypothesis: Hypothesis, timings: dict[str, float]
 ) -> Refinement | None:
-    """Passes over well-spread tiles, each with better tone, point spread and transformation."""
+    """Passes over well-spread tiles, each with better tone, point spread and transformation.
+
+    Where the template turns out to be blurred, as rasters are that were enlarged, its pixels are
+    averaged until it no longer is: patches of so many pixels then show more.
+    """
     start = perf_counter()
     matrix = _coarse_refinement(part, hypothesis)
+    _add(timings, "refine", perf_counter() - start)
+    refined = _refine(part, matrix, hypothesis, timings)
+    while refined is not None and refined.is_blurred():
+        step = part.step * round(refined.tuning.sigma / DEFAULT_SIGMA)
+        part = replace(part, step=min(step, part.largest_step))
+        coarser = _refine(part, matrix, hypothesis, timings)
+        if coarser is None:
+            break
+        refined = coarser
+    return refined
+
+
+def _refine(
+    part: Roles, matrix: FloatArray, hypothesis: Hypothesis, timings: dict[str, float]
+) -> Refinement | None:
+    start = perf_counter()
     region = overlap_in_template(part, matrix)
     if region is None:
         return None
-    threads, size = part.pair.threads, patch_size(region.width * region.height)
-    tiles = read_tiles(part, plan_tiles(region, part.surface_px_per_template_px), matrix, threads)
-    timings["read tiles"] = perf_counter() - start
+    size = patch_size(region.width * region.height / part.step**2)
+    tiles = read_tiles(part, plan_tiles(region, part), matrix, part.pair.threads)
+    _add(timings, "read tiles", perf_counter() - start)
     start = perf_counter()
     options = RefineOptions(size=_size_for(tiles, size))
     refined = _of_the_ground(part, tiles, hypothesis, matrix, options) if tiles else None
-    timings["refine"] = perf_counter() - start
+    _add(timings, "refine", perf_counter() - start)
     return refined
+
+
+def _add(timings: dict[str, float], step: str, seconds: float) -> None:
+    timings[step] = timings.get(step, 0.0) + seconds
 
 
 def _size_for(tiles: list[Tile], size: int) -> int:
@@ -125,7 +157,8 @@ def _of_the_ground(
     on more than a shift, or tell the place more sharply.
     """
     everything = _passes(part, tiles, matrix, options, (_PLAIN, *_SHARPER))
-    if hypothesis.bright is None or (everything is not None and _is_calm(everything.dense)):
+    clear = everything is not None and (everything.is_blurred() or _is_calm(everything.dense))
+    if hypothesis.bright is None or clear:
         return everything
     hidden = [dark_tile(part, tile, hypothesis) for tile in tiles]
     small = replace(options, size=_size_for(hidden, options.size))
@@ -171,8 +204,7 @@ def _near_header(part: Roles, matrix: FloatArray) -> bool:
     """True when the header is so close that patches could find the ground from there."""
     corners = part.pair.corners()
     gap = part.pair.to_reference(matrix, corners) - part.pair.to_reference(IDENTITY, corners)
-    step = max(part.pair.pan_px_per_source_px, 1.0)
-    return bool(np.hypot(*gap.T).max() < _NEAR_HEADER_PX * step)
+    return bool(np.hypot(*gap.T).max() < _NEAR_HEADER_PX * part.pan_px_per_patch_px)
 
 
 def _is_shift(dense: Dense) -> bool:
@@ -228,8 +260,8 @@ def _passes(
                 break  # no other start could please more patches
         if near is not None:
             break
-    if near is None:
-        return None
+    if near is None or near.is_blurred():
+        return near
     if not _is_calm(near.dense):
         near = _sharpest(part, near, others, options, threads)
     tone = fit_tone(part, tiles, near.matrix, near.tuning.sigma, threads)
@@ -238,7 +270,8 @@ def _passes(
     dense = match_pass(part, tiles, near.matrix, tuning, options, threads)
     if dense.estimate is None:
         return None
-    return Refinement(tiles, tuning, dense, dense.estimate.transformation.matrix, options.size)
+    matrix = dense.estimate.transformation.matrix
+    return Refinement(part, tiles, tuning, dense, matrix, options.size)
 
 
 def _approach(
@@ -263,7 +296,7 @@ def _approach(
         if dense.estimate is None:
             return None
         matrix = dense.estimate.transformation.matrix
-        near = Refinement(tiles, tuning, dense, matrix, options.size)
+        near = Refinement(part, tiles, tuning, dense, matrix, options.size)
     return near
 
 

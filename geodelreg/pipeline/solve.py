@@ -101,11 +101,11 @@ class Fitted:
 def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
     """Refine a hypothesis by dense patches and judge it; None when too few patches match."""
     timings: dict[str, float] = {}
-    part = roles(pair)
     start = perf_counter()
-    refined = refine_densely(part, hypothesis, timings)
+    refined = refine_densely(roles(pair), hypothesis, timings)
     if refined is None:
         return None
+    part = refined.part
     status = _on_the_mesh(refined.dense)
     kept = status == Status.KEPT
     points = refined.dense.observations.take(kept)
@@ -122,12 +122,12 @@ def solve(pair: Pair, hypothesis: Hypothesis) -> Solution | None:
         selection,
         tied,
         dict(hypothesis.counts) | _patch_counts(refined, tied),
-        _agreement_log_nfa(pair, tied, selection.estimate.transformation.model),
+        _agreement_log_nfa(part, tied, selection.estimate.transformation.model),
         pair.pan_px_per_source_px
         * half_disagreement(points.take(selection.estimate.inlier), selection.estimate, corners),
     )
     timings["fit"] = perf_counter() - start - sum(timings.values())
-    return conclude(part, hypothesis, refined, fitted, timings)
+    return conclude(hypothesis, refined, fitted, timings)
 
 
 def unsolved() -> Solution:
@@ -171,16 +171,15 @@ def _patch_counts(refined: Refinement, points: TiePoints) -> dict[str, int]:
     }
 
 
-def _agreement_log_nfa(pair: Pair, points: TiePoints, model: str) -> float:
+def _agreement_log_nfa(part: Roles, points: TiePoints, model: str) -> float:
     """Chance agreement of patches, each of which may end anywhere within its reach."""
     matched = points.kept | np.isin(points.status, (Status.CONSENSUS, Status.STAR, Status.RESIDUAL))
     gap = np.hypot(*points.residual_px[matched].T)
-    reach = 2 * RefineOptions().max_move * max(pair.pan_px_per_source_px, 1.0)
+    reach = 2 * RefineOptions().max_move * part.pan_px_per_patch_px
     return log_nfa(gap, reach**2, PARAMETER_COUNT[model] // 2, reach / 2)[0]
 
 
 def conclude(
-    part: Roles,
     hypothesis: Hypothesis,
     refined: Refinement,
     fitted: Fitted,
@@ -188,11 +187,12 @@ def conclude(
 ) -> Solution:
     """Measure accuracy and evidence of a fitted model, and judge it."""
     start = perf_counter()
-    pair, estimate = part.pair, fitted.selection.estimate
+    part, estimate = refined.part, fitted.selection.estimate
+    pair = part.pair
     matrix = estimate.transformation.matrix
 
     def overlaid() -> tuple[Accuracy, float]:
-        before, after, wide = _overlays(part, hypothesis, refined, matrix)
+        before, after, wide = _overlays(hypothesis, refined, matrix)
         accuracy = measure(part, fitted.points, fitted.selection, before, after)
         return accuracy, rival_correlation(wide)
 
@@ -205,7 +205,7 @@ def conclude(
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)
         accuracy, rival = whole.result()
-    evidence = replace(_evidence(pair, fitted, accuracy, area), rival=rival, bands_apart=apart)
+    evidence = replace(_evidence(part, fitted, accuracy, area), rival=rival, bands_apart=apart)
     grid = pair.lattice()
     move = pair.to_reference(matrix, grid) - pair.to_reference(IDENTITY, grid)
     sigma = estimate.sigma_at(grid) * pair.pan_px_per_source_px
@@ -244,13 +244,14 @@ def tie_points(part: Roles, dense: Dense, matrix: FloatArray, status: StatusArra
 
 
 def _overlays(
-    part: Roles, hypothesis: Hypothesis, refined: Refinement, matrix: FloatArray
+    hypothesis: Hypothesis, refined: Refinement, matrix: FloatArray
 ) -> tuple[Overlay, Overlay, Overlay]:
     """Both images, decimated, one on the other: under the header and under the correction.
 
     The third is the second with all that was read of the finer image.
     """
-    tile, tuning = working_tile(part, hypothesis.pair), refined.tuning
+    part, tuning = refined.part, refined.tuning
+    tile = working_tile(part, hypothesis.pair)
     if refined.dark_only:
         tile = dark_tile(part, tile, hypothesis)
     if part.ms_is_template():
@@ -267,8 +268,9 @@ def _overlays(
     return overlay(part, template, surface, IDENTITY), after, everything
 
 
-def _evidence(pair: Pair, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence) -> Evidence:
+def _evidence(part: Roles, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence) -> Evidence:
     """What needs no more pixels."""
+    pair = part.pair
     matrix = fitted.selection.estimate.transformation.matrix
     metric = np.array(pair.frame().metric).reshape(2, 2)
     ground = metric @ matrix[:, :2] @ np.linalg.inv(metric)
@@ -288,6 +290,6 @@ def _evidence(pair: Pair, fitted: Fitted, accuracy: Accuracy, area: AreaEvidence
         shift_px=float(np.hypot(*shift[0])),
         rotation_deg=abs(turn),
         scale=float(max(stretch[0], 1 / max(stretch[1], 1e-9))),
-        rival_motion=rival_motion(fitted.points, max(pair.pan_px_per_source_px, 1.0)),
+        rival_motion=rival_motion(fitted.points, part.pan_px_per_patch_px),
         support=area.support,
     )

@@ -64,6 +64,9 @@ class Roles:
     pair : Pair
     template, surface : WindowReader
     template_bands, surface_bands : tuple of int
+    step : int
+        Template pixels, along either axis, that are averaged to one pixel of a patch: more than 1
+        where the template shows less than its pixels could, as enlarged rasters do.
     """
 
     pair: Pair
@@ -71,6 +74,7 @@ class Roles:
     surface: WindowReader
     template_bands: tuple[int, ...]
     surface_bands: tuple[int, ...]
+    step: int = 1
 
     def to_surface(self, matrix: FloatArray, template_px: FloatArray) -> FloatArray:
         """(..., 2) template pixels to surface pixels under a correction `matrix`."""
@@ -87,6 +91,23 @@ class Roles:
         """GSD ratio, at least 1."""
         ratio = self.pair.pan_px_per_source_px
         return ratio if self.pair.source_is_coarser else 1.0 / ratio
+
+    @property
+    def surface_px_per_patch_px(self) -> float:
+        """Surface pixels, along either axis, to one pixel of a patch."""
+        return self.step * self.surface_px_per_template_px
+
+    @property
+    def pan_px_per_patch_px(self) -> float:
+        """PAN pixels, along either axis, to one pixel of a patch."""
+        return self.step * max(self.pair.pan_px_per_source_px, 1.0)
+
+    @property
+    def largest_step(self) -> int:
+        """Step that leaves pixels for the patches that are wanted."""
+        height, width = self.template.grid.shape
+        least = _WANTED_PATCHES * SMALLEST_PATCH_PX**2
+        return max(int(np.sqrt(height * width / least)), 1)
 
     def ms_is_template(self) -> bool:
         """True when the MS image is the coarser one."""
@@ -144,21 +165,27 @@ def patch_size(visible_px: float) -> int:
     return int(np.clip(round(float(side)), SMALLEST_PATCH_PX, PATCH_PX))
 
 
-def plan_tiles(region: Window, ratio: float) -> list[Window]:
+def plan_tiles(region: Window, part: Roles) -> list[Window]:
     """Template windows to visit: adjoining where there are few, else spread evenly.
+
+    Tiles of many surface pixels are made smaller, so that all of them fit in memory.
 
     Parameters
     ----------
     region : Window
         Of the template, as from `overlap_in_template`.
-    ratio : float
-        Surface pixels to a template pixel; tiles of many surface pixels are made smaller, so that
-        all of them fit in memory.
+    part : Roles
+
+    Returns
+    -------
+    list of Window
+        Whole multiples of `Roles.step` wide and high.
     """
-    size = patch_size(region.width * region.height)
+    step, ratio = part.step, part.surface_px_per_patch_px
+    size = patch_size(region.width * region.height / step**2)
     patches = _SPREAD_TILE_PATCHES if ratio < _FINE_RATIO else _SPREAD_TILE_PATCHES_FINE
-    columns = _spans(region.column, region.width, size, patches)
-    rows = _spans(region.row, region.height, size, patches)
+    columns = _spans(region.column, region.width, size * step, patches)
+    rows = _spans(region.row, region.height, size * step, patches)
     return [Window(x, y, width, height) for y, height in rows for x, width in columns]
 
 
@@ -186,13 +213,14 @@ def read_tile(part: Roles, window: Window, matrix: FloatArray) -> Tile | None:
     place = part.to_surface(matrix, corners)
     if not np.isfinite(place).all():
         return None
-    ratio = part.surface_px_per_template_px
+    ratio = part.surface_px_per_patch_px
     margin = (0.7 * _LOW_PASS_REACH + _SLACK_PX) * ratio + SPLINE_REACH_PX
     around = _clip(place.min(axis=0) - margin, place.max(axis=0) + margin, part.surface.grid)
     if around is None:
         return None
+    shape = (window.height // part.step, window.width // part.step)
     return Tile(
-        part.template.read(part.template_bands, window),
+        part.template.read(part.template_bands, window, shape),
         part.surface.read(part.surface_bands, around),
     )
 

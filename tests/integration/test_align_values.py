@@ -11,6 +11,8 @@ import pytest
 import rasterio
 from affine import Affine
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from scipy import ndimage
 
 from geodelreg import align
 from geodelreg.pipeline.state import MOST_BANDS
@@ -107,6 +109,32 @@ def test_one_band_is_enough(standard: Scene, tmp_path: Path) -> None:
     alignment = align(changed(standard.ms, tmp_path, lambda data: data[1:2]), standard.pan)
     assert standard.rmse_px(alignment.correction.corrected) < 0.1
     assert list(alignment.band_weights) == ["band 1"]
+
+
+@pytest.mark.parametrize("resampling", [Resampling.nearest, Resampling.cubic])
+@pytest.mark.parametrize("factor", [2, 4])
+def test_enlarged_rasters_fit_as_well(
+    standard: Scene, tmp_path: Path, factor: int, resampling: Resampling
+) -> None:
+    """MS that was resampled to PAN's grid, say, shows no more than it did before."""
+    with rasterio.open(standard.ms) as dataset:
+        shape = (dataset.count, factor * dataset.height, factor * dataset.width)
+        data = dataset.read(out_shape=shape, resampling=resampling)
+        header = dataset.transform @ Affine.scale(1 / factor)
+        ms = write(tmp_path / "ms.tif", data, header, dataset.crs.to_wkt())
+    alignment = align(ms, standard.pan)
+    back = alignment.correction.corrected @ Affine.scale(factor)
+    assert standard.rmse_px(back) < 0.03
+    assert alignment.accuracy.sigma_corner_px < 0.06
+
+
+@pytest.mark.parametrize("sigma", [0.7, 1.2])
+def test_out_of_focus_rasters_fit(standard: Scene, tmp_path: Path, sigma: float) -> None:
+    def blurred(data: Pixels) -> NDArray[np.generic]:
+        return ndimage.gaussian_filter(data.astype(np.float32), (0, sigma, sigma))
+
+    alignment = align(changed(standard.ms, tmp_path, blurred), standard.pan)
+    assert standard.rmse_px(alignment.correction.corrected) < 0.1
 
 
 def test_a_raster_lies_on_itself(standard: Scene) -> None:

@@ -19,6 +19,7 @@ PART = cast(
     SimpleNamespace(
         pair=SimpleNamespace(frame=lambda: Frame((100.0, 100.0), 100.0)),
         ms_is_template=lambda: True,
+        step=1,
     ),
 )
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from affine import Affine
@@ -61,13 +62,22 @@ class ArrayReader:
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
     ) -> list[Band]:
-        assert shape in (None, (window.height, window.width))
         rows = slice(window.row, window.row + window.height)
         columns = slice(window.column, window.column + window.width)
+        height, width = shape or (window.height, window.width)
         moved = self.grid.transform @ Affine.translation(window.column, window.row)
-        grid = Grid(moved, (window.height, window.width), self.grid.crs_wkt)
+        larger = Affine.scale(window.width / width, window.height / height)
+        grid = Grid(moved @ larger, (height, width), self.grid.crs_wkt)
+
+        def averaged(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            inner = np.ascontiguousarray(image[rows, columns])
+            return cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
+
         chosen = [self.bands[number - 1] for number in bands]
-        return [Band(band.data[rows, columns], band.valid[rows, columns], grid) for band in chosen]
+        return [
+            Band(averaged(band.data), averaged(band.valid.astype(np.float32)) > 0.5, grid)
+            for band in chosen
+        ]
 
 
 def texture(seed: int, shape: tuple[int, int] = (SIDE, SIDE)) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from geodelreg.fit.estimate import Observations
 from geodelreg.fit.models import IDENTITY
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, agreement
+from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, _lowest, agreement
 from geodelreg.pipeline.refinement import (
     Refinement,
     _is_shift,
@@ -56,6 +56,38 @@ def test_patches_match_where_every_field_changed_in_its_own_way(seed: int) -> No
     np.testing.assert_allclose(refined.matrix[:, 2], -shift, atol=0.15)
 
 
+@pytest.mark.parametrize("factor", [1, 3])
+def test_pixels_of_enlarged_rasters_are_averaged(factor: int) -> None:
+    place = Affine(8.0, 0.0, 5e5, 0.0, -8.0, 1e6)
+    crs = CRS.from_epsg(32616).to_wkt()
+    fine = ndimage.gaussian_filter(texture(5, (640, 640)), 1.0)
+    small = fine.reshape(160, 4, 160, 4).mean(axis=(1, 3))
+    ms = ndimage.zoom(small, factor, order=1, mode="nearest", grid_mode=True)
+
+    def band(values: NDArray[np.float64], pixel: float) -> Band:
+        valid = np.ones(values.shape, dtype=bool)
+        grid = Grid(place @ Affine.scale(pixel), values.shape, crs)
+        return Band(values.astype(np.float32), valid, grid)
+
+    source, reference = ArrayReader((band(ms, 1 / factor),)), ArrayReader((band(fine, 0.25),))
+    pair = make_pair(source, reference, AlignOptions())
+    images = read_working_pair(pair, next(scopes(pair)))
+    refined = refine_densely(roles(pair), Hypothesis(IDENTITY, float("nan"), {}, images), {})
+    assert refined is not None
+    assert (refined.part.step > 1) == (factor > 1)
+    assert not refined.is_blurred()
+    np.testing.assert_allclose(refined.matrix, IDENTITY, atol=0.01 * factor)
+
+
+def test_the_lowest_place_lies_between_its_neighbours() -> None:
+    assert _lowest({0.3: 2.0, 0.4: 1.0, 0.5: 2.0}) == pytest.approx(0.4)
+    assert _lowest(
+        {place: (place - 0.95) ** 2 for place in (0.7, 0.85, 1.0, 1.2)}
+    ) == pytest.approx(0.95)
+    assert _lowest({0.3: 1.0, 0.4: 2.0}) == 0.3
+    assert _lowest({0.3: 1.0, 0.4: 1.0, 0.5: 1.0}) == 0.3
+
+
 def refinement(count: int, noise_px: float) -> Refinement:
     """Of so many patches that agree to within the noise."""
     rng = np.random.default_rng(count)
@@ -69,7 +101,7 @@ def refinement(count: int, noise_px: float) -> Refinement:
     status, estimate = agreement(roles(pair), points, status, IDENTITY)
     assert estimate is not None
     dense = Dense(_concatenate([]), points, status, estimate)
-    return Refinement([], Tuning(0.5, single_band(1, 0)), dense, IDENTITY, 20)
+    return Refinement(roles(pair), [], Tuning(0.5, single_band(1, 0)), dense, IDENTITY, 20)
 
 
 def test_a_shift_of_few_patches_is_not_preferred_to_an_affine_of_many() -> None:
