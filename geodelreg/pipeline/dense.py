@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robus
 from geodelreg.fit.models import Frame, Transformation
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.synthetic_pan import SyntheticPan, fit_synthetic_pan, single_band
-from geodelreg.match.consensus import consensus_affine, radial_residuals
+from geodelreg.match.consensus import consensus_affine
 from geodelreg.match.refine import Refined, RefineOptions, cut_patches, gather, refine
 from geodelreg.match.surface import Surface, high_pass, make_surface, sample
 from geodelreg.pipeline.tiles import Roles, Tile
@@ -37,6 +38,8 @@ _CORE_FLOOR_PX = 0.03
 _SHIFT_SHARE = 0.15
 _AFFINE_SHARE = 0.25
 _CORE_REACH = 2.0
+_OUTSTANDING = 1.8
+_OUTSTANDING_OF_CLOUDS = 1.0  # their heights spread less than normal errors do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,7 +285,8 @@ def agreement(
     unit = part.step if part.ms_is_template() else part.surface_px_per_patch_px
     estimate = _fit_all(points.take(kept), matrix, frame)
     if estimate is not None and _is_mixed(estimate, unit):
-        inliers = _rigid_core(points.take(kept), unit)
+        outstanding = _OUTSTANDING_OF_CLOUDS if part.clouds else _OUTSTANDING
+        inliers = _rigid_core(points.take(kept), unit, outstanding)
         status[kept[~inliers]] = Status.CONSENSUS
         kept = kept[inliers]
         estimate = _fit_all(points.take(kept), matrix, frame)
@@ -316,40 +320,49 @@ def _shifted(points: Observations, matrix: FloatArray, frame: Frame) -> Estimate
     return replace(estimate, transformation=Transformation("shift", moved))
 
 
-def _rigid_core(points: Observations, unit: float) -> BoolArray:
+def _rigid_core(points: Observations, unit: float, outstanding: float) -> BoolArray:
     """Points near the shift, or else the affine, that a fair share fits to within the noise.
 
     The ground is rigid: its patches agree to within their noise.  Clouds at various heights do not,
     however many they are.  The tolerance starts at the noise and grows until enough points agree.
+    If they stand out from the others they are the core; over relief, which displaces neighbours
+    alike and no place as it does the next, none do, and all points have their say.
     """
     variance = points.covariance[:, 0, 0] + points.covariance[:, 1, 1]
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance))), _CORE_FLOOR_PX * unit)
     while tolerance <= unit:
         residuals = list(_rigid_residuals(points, variance, tolerance))
-        shares = [float((residual <= tolerance).mean()) for residual in residuals]
+        shares = [float((np.hypot(*gap.T) <= tolerance).mean()) for gap in residuals]
         if shares[0] >= max(_SHIFT_SHARE, shares[-1] / 2):
-            return _near(residuals[0], tolerance, variance)
+            return _core(residuals[0], tolerance, variance, outstanding)
         if shares[-1] >= _AFFINE_SHARE:
-            return _near(residuals[-1], tolerance, variance)
+            return _core(residuals[-1], tolerance, variance, outstanding)
         tolerance *= 1.5
     return np.ones(len(points), dtype=bool)
 
 
-def _near(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolArray:
-    return np.asarray(residual**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
+def _core(
+    residual: FloatArray, tolerance: float, variance: FloatArray, outstanding: float
+) -> BoolArray:
+    """Points around 0, if so many times more lie there than of a normal distribution as wide."""
+    radius = np.hypot(*residual.T)
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(residual.T)))
+    fair = math.prod(math.erf(tolerance / (math.sqrt(2) * max(s, 1e-9))) for s in spread)
+    if (radius <= tolerance).mean() < outstanding * fair:
+        return np.ones(len(radius), dtype=bool)
+    return np.asarray(radius**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
 
 
 def _rigid_residuals(
     points: Observations, variance: FloatArray, tolerance: float
 ) -> Iterator[FloatArray]:
-    """(N,) residuals of the best shift of the header, then of the best affine."""
+    """(N, 2) residuals of the best shift of the header, then of the best affine."""
     move = points.target - points.source
     near = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1)) <= tolerance
-    middle = move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
-    yield np.hypot(*(move - middle).T)
+    yield move - move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
     found = consensus_affine(points.source, points.target, variance, tolerance, kind="affine")
     if np.isfinite(found.matrix).all():
-        yield radial_residuals(found.matrix, points.source, points.target)
+        yield points.target - Transformation("affine", found.matrix)(points.source)
 
 
 def _concatenate(parts: list[Refined]) -> Refined:

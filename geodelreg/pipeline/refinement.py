@@ -47,6 +47,7 @@ _CLEARLY = 0.8
 _MOVE_PX = 0.1
 _CONTRADICTION_SIGMAS = 4.0
 _CONTRADICTION_FLOOR_PX = 0.05
+_RELIEF_SIGMAS = 2.0
 _CALM_SHARE = 0.9
 _CALM_SIGMA_PX = 0.02
 _SHARPER_SHARE = 0.6
@@ -100,6 +101,7 @@ def refine_densely(
     averaged until it no longer is: patches of so many pixels then show more.
     """
     start = perf_counter()
+    part = replace(part, clouds=hypothesis.bright is not None)
     matrix = _coarse_refinement(part, hypothesis)
     _add(timings, "refine", perf_counter() - start)
     refined = _refine(part, matrix, hypothesis, timings)
@@ -189,15 +191,26 @@ def _is_calm(dense: Dense) -> bool:
         return False
     textured = dense.status != Status.TEXTURE
     share = float((dense.status[textured] == Status.KEPT).mean()) if textured.any() else 0.0
-    return share > _CALM_SHARE and dense.estimate.extra_variance_px2 < _CALM_SIGMA_PX**2
+    return share > _CALM_SHARE and _scatter(dense) < _CALM_SIGMA_PX
 
 
 def _agree(part: Roles, one: Refinement, other: Refinement | None) -> bool:
-    """True when two refinements differ by no more than their standard errors allow."""
+    """True when two refinements differ by no more than their errors allow.
+
+    Relief displaces neighbours alike, so that patches at other places may say something else by as
+    much as all of them scatter.
+    """
     if other is None:
         return False
     gap, sigma = _difference(part, one.dense, other.dense)
-    return gap <= _CONTRADICTION_SIGMAS * sum(sigma) + _CONTRADICTION_FLOOR_PX
+    scatter = _RELIEF_SIGMAS * max(_scatter(one.dense), _scatter(other.dense))
+    return gap <= _CONTRADICTION_SIGMAS * sum(sigma) + max(scatter, _CONTRADICTION_FLOOR_PX)
+
+
+def _scatter(dense: Dense) -> float:
+    """Of patches beyond their own noise, in MS pixels."""
+    assert dense.estimate is not None
+    return float(np.sqrt(dense.estimate.extra_variance_px2))
 
 
 def _near_header(part: Roles, matrix: FloatArray) -> bool:

@@ -17,7 +17,14 @@ from scipy import ndimage
 from geodelreg import align
 from geodelreg.pipeline.state import MOST_BANDS
 from geodelreg.types import Outcome
-from tests.integration.align_scenes import Pixels, Recipe, Scene, centred, make_scene, write
+from tests.integration.align_scenes import (
+    Pixels,
+    Recipe,
+    Scene,
+    centred,
+    make_scene,
+    write,
+)
 
 STANDARD = Recipe(centred(4, 130), (130, 130))
 Change = Callable[[Pixels], NDArray[np.generic]]
