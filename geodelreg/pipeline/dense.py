@@ -29,6 +29,7 @@ _SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is 
 _TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
 _CLEARLY = 0.9
+_MUCH_UNLIKE = 0.5
 _SIGMA_PIXELS = 300_000
 _SIGMA_SAMPLES = 8_000
 _MIXED_SIGMA = 0.03
@@ -38,8 +39,6 @@ _CORE_FLOOR_PX = 0.03
 _SHIFT_SHARE = 0.15
 _AFFINE_SHARE = 0.25
 _CORE_REACH = 2.0
-_OUTSTANDING = 1.8
-_OUTSTANDING_OF_CLOUDS = 1.0  # their heights spread less than normal errors do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,6 +190,8 @@ def fit_sigma(
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         unlike = dict(zip(_SIGMA_CANDIDATES, pool.map(unexplained, _SIGMA_CANDIDATES), strict=True))
     usual = min(unlike.values())
+    if usual > _MUCH_UNLIKE * len(chosen):  # clouds, of which low-passing hides more and more
+        return _lowest(unlike)
     for softer in _SOFTER:
         if min(unlike, key=unlike.__getitem__) != max(unlike):
             break
@@ -213,7 +214,7 @@ def _lowest(values: dict[float, float]) -> float:
 
 def _unexplained(one: Float32Array, other: Float32Array) -> float:
     if len(one) < 32 or not (one.std() > 0 and other.std() > 0):
-        return 0.0
+        return 1.0
     return 1.0 - float(np.corrcoef(one, other)[0, 1]) ** 2
 
 
@@ -285,8 +286,7 @@ def agreement(
     unit = part.step if part.ms_is_template() else part.surface_px_per_patch_px
     estimate = _fit_all(points.take(kept), matrix, frame)
     if estimate is not None and _is_mixed(estimate, unit):
-        outstanding = _OUTSTANDING_OF_CLOUDS if part.clouds else _OUTSTANDING
-        inliers = _rigid_core(points.take(kept), unit, outstanding)
+        inliers = _rigid_core(points.take(kept), unit)
         status[kept[~inliers]] = Status.CONSENSUS
         kept = kept[inliers]
         estimate = _fit_all(points.take(kept), matrix, frame)
@@ -320,7 +320,7 @@ def _shifted(points: Observations, matrix: FloatArray, frame: Frame) -> Estimate
     return replace(estimate, transformation=Transformation("shift", moved))
 
 
-def _rigid_core(points: Observations, unit: float, outstanding: float) -> BoolArray:
+def _rigid_core(points: Observations, unit: float) -> BoolArray:
     """Points near the shift, or else the affine, that a fair share fits to within the noise.
 
     The ground is rigid: its patches agree to within their noise.  Clouds at various heights do not,
@@ -334,21 +334,19 @@ def _rigid_core(points: Observations, unit: float, outstanding: float) -> BoolAr
         residuals = list(_rigid_residuals(points, variance, tolerance))
         shares = [float((np.hypot(*gap.T) <= tolerance).mean()) for gap in residuals]
         if shares[0] >= max(_SHIFT_SHARE, shares[-1] / 2):
-            return _core(residuals[0], tolerance, variance, outstanding)
+            return _core(residuals[0], tolerance, variance)
         if shares[-1] >= _AFFINE_SHARE:
-            return _core(residuals[-1], tolerance, variance, outstanding)
+            return _core(residuals[-1], tolerance, variance)
         tolerance *= 1.5
     return np.ones(len(points), dtype=bool)
 
 
-def _core(
-    residual: FloatArray, tolerance: float, variance: FloatArray, outstanding: float
-) -> BoolArray:
-    """Points around 0, if so many times more lie there than of a normal distribution as wide."""
+def _core(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolArray:
+    """Points around 0, if more lie there than of a normal distribution as wide as theirs."""
     radius = np.hypot(*residual.T)
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(residual.T)))
     fair = math.prod(math.erf(tolerance / (math.sqrt(2) * max(s, 1e-9))) for s in spread)
-    if (radius <= tolerance).mean() < outstanding * fair:
+    if (radius <= tolerance).mean() < fair:
         return np.ones(len(radius), dtype=bool)
     return np.asarray(radius**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
 

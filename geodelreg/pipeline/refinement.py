@@ -101,7 +101,6 @@ def refine_densely(
     averaged until it no longer is: patches of so many pixels then show more.
     """
     start = perf_counter()
-    part = replace(part, clouds=hypothesis.bright is not None)
     matrix = _coarse_refinement(part, hypothesis)
     _add(timings, "refine", perf_counter() - start)
     refined = _refine(part, matrix, hypothesis, timings)

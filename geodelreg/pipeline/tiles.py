@@ -67,8 +67,6 @@ class Roles:
     step : int
         Template pixels, along either axis, that are averaged to one pixel of a patch: more than 1
         where the template shows less than its pixels could, as enlarged rasters do.
-    clouds : bool
-        Bright objects are in sight, which may be clouds and move by themselves.
     """
 
     pair: Pair
@@ -77,7 +75,6 @@ class Roles:
     template_bands: tuple[int, ...]
     surface_bands: tuple[int, ...]
     step: int = 1
-    clouds: bool = False
 
     def to_surface(self, matrix: FloatArray, template_px: FloatArray) -> FloatArray:
         """(..., 2) template pixels to surface pixels under a correction `matrix`."""
