@@ -169,28 +169,40 @@ def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Su
 
 
 def fit_sigma(
-    part: Roles, tiles: list[Tile], matrix: FloatArray, tuning: Tuning, threads: int
+    part: Roles, tiles: list[Tile], near: Dense, tuning: Tuning, size: int, threads: int
 ) -> float:
-    """Low-pass with which the finer image resembles the coarser one most, in template pixels."""
+    """Low-pass with which the finer image resembles the coarser one most, in template pixels.
+
+    Judged where patches of `size` pixels agreed in the pass before: clouds have a sharpness, too.
+    """
+    assert near.estimate is not None
+    matrix = near.estimate.transformation.matrix
+    agreed = near.refined.template_px[near.status == Status.KEPT]
     count = max(_SIGMA_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
     per_tile = max(_SIGMA_SAMPLES // len(chosen), 64)
+    lattices = [_lattice(tile.template[0], part, per_tile) for tile in chosen]
+    reach = size * part.step / 2
+    in_patches = [
+        (np.abs(xy[:, None] - agreed) <= reach).all(axis=2).any(axis=1) for xy, _ in lattices
+    ]
 
     def unexplained(sigma: float) -> float:
         total = 0.0
-        for tile in chosen:
+        for tile, (xy, take), inside in zip(chosen, lattices, in_patches, strict=True):
             images = Tile(tile.template, tile.surface)
             (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
-            xy, take = _lattice(template, part, per_tile)
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
-            good = usable[:, 0] & template.valid[take]
+            good = usable[:, 0] & template.valid[take] & inside
             total += _unexplained(values[good, 0], template.data[take][good])
         return total
 
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         unlike = dict(zip(_SIGMA_CANDIDATES, pool.map(unexplained, _SIGMA_CANDIDATES), strict=True))
     usual = min(unlike.values())
-    if usual > _MUCH_UNLIKE * len(chosen):  # clouds, of which low-passing hides more and more
+    if usual >= len(chosen):  # nowhere enough to judge by
+        return tuning.sigma
+    if usual > _MUCH_UNLIKE * len(chosen):  # low-passing hides more and more of what is unlike
         return _lowest(unlike)
     for softer in _SOFTER:
         if min(unlike, key=unlike.__getitem__) != max(unlike):

@@ -301,8 +301,8 @@ def _approach(
     for number in range(passes):
         tone = fit_tone(part, tiles, matrix, sigma, threads, _FEWER_SAMPLES)
         tuning = Tuning(sigma, tone, look[0], local)
-        if number == 1 and not local:  # only a common tone has a common sharpness
-            sigma = fit_sigma(part, tiles, matrix, tuning, threads)
+        if near is not None and number == 1 and not local:  # without a common tone no sharpness
+            sigma = fit_sigma(part, tiles, near.dense, tuning, options.size, threads)
             tuning = replace(tuning, sigma=sigma)
         dense = match_pass(part, tiles, matrix, tuning, options, threads)
         if dense.estimate is None:
