@@ -24,14 +24,8 @@ from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Status, S
 logger = logging.getLogger(__name__)
 
 DEFAULT_SIGMA = 0.5
-_SIGMA_CANDIDATES = (0.3, 0.4, 0.5, 0.6, 0.7)
-_SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is out of focus
 _TONE_SAMPLES = 8_000
 _LEAST_SAMPLES = 64
-_CLEARLY = 0.9
-_MUCH_UNLIKE = 0.5
-_SIGMA_PIXELS = 300_000
-_SIGMA_SAMPLES = 8_000
 _MIXED_SIGMA = 0.03
 _GROUP_PATCHES = 100
 _CORE_SIGMAS = 1.5
@@ -114,7 +108,7 @@ def fit_tone(
     per_tile = max(samples // len(tiles), 64)
 
     def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
-        xy, take = _lattice(tile.template[0], part, per_tile)
+        xy, take = lattice(tile.template[0], part, per_tile)
         surfaces = _surfaces(part, tile, sigma)
         place = part.to_surface(matrix, xy)[:, None]
         fine = [sample(surface, place) for surface in surfaces]
@@ -138,7 +132,7 @@ def _surfaces(part: Roles, tile: Tile, sigma: float) -> list[Surface]:
     return [make_surface(band, grid, low_pass) for band in tile.surface]
 
 
-def _lattice(
+def lattice(
     band: Band, part: Roles, count: int
 ) -> tuple[FloatArray, tuple[np.ndarray, np.ndarray]]:
     """About `count` pixels of a template band, evenly spread: full-raster centres, and indices."""
@@ -166,68 +160,6 @@ def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Su
     if tuning.high_pass:
         templates = [high_pass(band, tuning.high_pass) for band in templates]
     return templates, surface
-
-
-def fit_sigma(
-    part: Roles, tiles: list[Tile], near: Dense, tuning: Tuning, size: int, threads: int
-) -> float:
-    """Low-pass with which the finer image resembles the coarser one most, in template pixels.
-
-    Judged where patches of `size` pixels agreed in the pass before: clouds have a sharpness, too.
-    """
-    assert near.estimate is not None
-    matrix = near.estimate.transformation.matrix
-    agreed = near.refined.template_px[near.status == Status.KEPT]
-    count = max(_SIGMA_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
-    chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
-    per_tile = max(_SIGMA_SAMPLES // len(chosen), 64)
-    lattices = [_lattice(tile.template[0], part, per_tile) for tile in chosen]
-    reach = size * part.step / 2
-    in_patches = [
-        (np.abs(xy[:, None] - agreed) <= reach).all(axis=2).any(axis=1) for xy, _ in lattices
-    ]
-
-    def unexplained(sigma: float) -> float:
-        total = 0.0
-        for tile, (xy, take), inside in zip(chosen, lattices, in_patches, strict=True):
-            images = Tile(tile.template, tile.surface)
-            (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
-            values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
-            good = usable[:, 0] & template.valid[take] & inside
-            total += _unexplained(values[good, 0], template.data[take][good])
-        return total
-
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        unlike = dict(zip(_SIGMA_CANDIDATES, pool.map(unexplained, _SIGMA_CANDIDATES), strict=True))
-    usual = min(unlike.values())
-    if usual >= len(chosen):  # nowhere enough to judge by
-        return tuning.sigma
-    if usual > _MUCH_UNLIKE * len(chosen):  # low-passing hides more and more of what is unlike
-        return _lowest(unlike)
-    for softer in _SOFTER:
-        if min(unlike, key=unlike.__getitem__) != max(unlike):
-            break
-        unlike[softer] = unexplained(softer)
-    if min(unlike.values()) > _CLEARLY * usual:  # changed ground is as like at any sharpness
-        unlike = {sigma: unlike[sigma] for sigma in _SIGMA_CANDIDATES}
-    return _lowest(unlike)
-
-
-def _lowest(values: dict[float, float]) -> float:
-    """Where the parabola through the lowest value and its neighbours is lowest."""
-    places = sorted(values)
-    best = min(range(len(places)), key=lambda i: values[places[i]])
-    if best in (0, len(places) - 1):
-        return places[best]
-    near = places[best - 1 : best + 2]
-    bend, slope, _ = np.polyfit(near, [values[place] for place in near], 2)
-    return float(np.clip(-slope / (2 * bend), near[0], near[2])) if bend > 0 else near[1]
-
-
-def _unexplained(one: Float32Array, other: Float32Array) -> float:
-    if len(one) < 32 or not (one.std() > 0 and other.std() > 0):
-        return 1.0
-    return 1.0 - float(np.corrcoef(one, other)[0, 1]) ** 2
 
 
 def match_pass(

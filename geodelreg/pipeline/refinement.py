@@ -13,11 +13,11 @@ from geodelreg.pipeline.dense import (
     DEFAULT_SIGMA,
     Dense,
     Tuning,
-    fit_sigma,
     fit_tone,
     match_pass,
 )
 from geodelreg.pipeline.search import Hypothesis, WorkingPair
+from geodelreg.pipeline.sharpness import fit_sigma
 from geodelreg.pipeline.tiles import (
     Roles,
     Tile,

@@ -13,7 +13,7 @@ from geodelreg.fit.estimate import Observations
 from geodelreg.fit.models import IDENTITY
 from geodelreg.image.synthetic_pan import single_band
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, _lowest, agreement
+from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, agreement
 from geodelreg.pipeline.refinement import (
     Refinement,
     _is_shift,
@@ -21,6 +21,7 @@ from geodelreg.pipeline.refinement import (
     refine_densely,
 )
 from geodelreg.pipeline.search import Hypothesis, read_working_pair, scopes
+from geodelreg.pipeline.sharpness import _lowest
 from geodelreg.pipeline.state import make_pair
 from geodelreg.pipeline.tiles import roles
 from geodelreg.types import Band, Grid, Status
