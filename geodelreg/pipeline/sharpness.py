@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from geodelreg.geo.affine import apply_affine
 from geodelreg.match.surface import sample
 from geodelreg.pipeline.dense import Dense, Tuning, lattice, tile_images
 from geodelreg.pipeline.tiles import Roles, Tile
-from geodelreg.types import Float32Array, Status
+from geodelreg.types import Band, BoolArray, Float32Array, FloatArray, Status
 
 _USUAL = (0.3, 0.4, 0.5, 0.6, 0.7)
 _SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is out of focus
@@ -34,18 +35,15 @@ def fit_sigma(
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
     per_tile = max(_SAMPLES // len(chosen), 64)
     lattices = [lattice(tile.template[0], part, per_tile) for tile in chosen]
-    reach = size * part.step / 2
-    in_patches = [
-        (np.abs(xy[:, None] - agreed) <= reach).all(axis=2).any(axis=1) for xy, _ in lattices
-    ]
+    covered = [_covered(part, tile.template[0], agreed, size) for tile in chosen]
 
     def unexplained(sigma: float) -> float:
         total = 0.0
-        for tile, (xy, take), inside in zip(chosen, lattices, in_patches, strict=True):
+        for tile, (xy, take), inside in zip(chosen, lattices, covered, strict=True):
             images = Tile(tile.template, tile.surface)
             (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
             values, usable = sample(surface, part.to_surface(matrix, xy)[:, None])
-            good = usable[:, 0] & template.valid[take] & inside
+            good = usable[:, 0] & template.valid[take] & inside[take]
             total += _unexplained(values[good, 0], template.data[take][good])
         return total
 
@@ -63,6 +61,20 @@ def fit_sigma(
     if min(unlike.values()) > _CLEARLY * usual:  # changed ground is as like at any sharpness
         unlike = {sigma: unlike[sigma] for sigma in _USUAL}
     return _lowest(unlike)
+
+
+def _covered(part: Roles, band: Band, centres: FloatArray, size: int) -> BoolArray:
+    """(H, W) True where patches of `size` pixels of a template band lie."""
+    inside = np.zeros(band.data.shape, dtype=np.bool_)
+    to_band = ~band.grid.transform @ part.template.grid.transform
+    corners = np.rint(apply_affine(to_band, centres) - size / 2).astype(int)
+    for column, row in corners.tolist():
+        rows, columns = (
+            slice(max(row, 0), max(row + size, 0)),
+            slice(max(column, 0), max(column + size, 0)),
+        )
+        inside[rows, columns] = True
+    return inside
 
 
 def _lowest(values: dict[float, float]) -> float:
