@@ -7,10 +7,12 @@ import numpy as np
 from geodelreg.fit.select import spatial_blocks
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair, bands_asked
-from geodelreg.types import FloatArray
+from geodelreg.types import FloatArray, Status, TiePoints
 
 LOCAL_RMS_PX = 0.3
 """Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
+_MANY_ELSEWHERE = 0.3
+"""Share of the patches that matched, but elsewhere, above which nobody knows who is right."""
 _LOCAL_SIGNIFICANCE = 3.0
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
@@ -45,18 +47,37 @@ def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
             f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
             "(terrain, or bands that do not agree); a local warp would be needed"
         )
+    share, distance = elsewhere(solution.tie_points)
+    if share > _MANY_ELSEWHERE and distance > LOCAL_RMS_PX:
+        notes.append(
+            f"{share:.0%} of the patches that matched lie elsewhere, {distance:.2g} PAN px off in "
+            "the median (terrain, clouds, or changes): the correction and its standard error are "
+            "those of the others; over terrain a local warp would be needed"
+        )
     return tuple(notes)
+
+
+def elsewhere(points: TiePoints) -> tuple[float, float]:
+    """Share of the patches that matched elsewhere than the correction says, and how far off.
+
+    The distance is the median of theirs in PAN pixels; NaN where there are none.
+    """
+    away = np.isin(points.status, (Status.CONSENSUS, Status.STAR, Status.RESIDUAL))
+    if not away.any():
+        return 0.0, float("nan")
+    share = float(away.sum() / (away.sum() + points.kept.sum()))
+    return share, float(np.median(np.hypot(*points.residual_px[away].T)))
 
 
 def local_distortion(pair: Pair, solution: Solution) -> float:
     """RMS of what is left over smoothly, in PAN pixels; 0 when it is within the noise.
 
     Residuals are averaged over blocks; their variance beyond that of the noise is distortion.
-    NaN when there are too few tie points to tell.
+    NaN when there are too few tie points to tell, or too many of them lie elsewhere.
     """
     points = solution.tie_points
     kept = points.kept
-    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK:
+    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK or elsewhere(points)[0] > _MANY_ELSEWHERE:
         return float("nan")
     block = spatial_blocks(points.source_px[kept], _BLOCKS)
     residual = points.residual_px[kept]

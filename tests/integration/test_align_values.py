@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from scipy import ndimage
 
-from geodelreg import align
+from geodelreg import align, check
 from geodelreg.pipeline.state import MOST_BANDS
 from geodelreg.types import Outcome
 from tests.integration.align_scenes import (
@@ -167,3 +167,19 @@ def test_undeclared_frames_do_not_lead(tmp_path: Path) -> None:
     scene = make_scene(tmp_path, replace(STANDARD, change=frame))
     alignment = align(scene.ms, scene.pan)
     assert scene.rmse_px(alignment.correction.corrected) < 0.05
+
+
+def test_relief_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+    """Parallax moves patches along one direction; some agree by chance, and all others say so."""
+
+    def parallax(ms: Pixels, _: Pixels) -> None:
+        height = ndimage.gaussian_filter(np.random.default_rng(2).normal(size=ms.shape[1:]), 18)
+        rows, columns = np.mgrid[: ms.shape[1], : ms.shape[2]]
+        places = [rows, columns + 0.3 * height / height.std()]
+        for band in ms:
+            band[:] = ndimage.map_coordinates(band, places, mode="reflect").clip(0, 4095)
+
+    scene = make_scene(tmp_path, replace(STANDARD, change=parallax))
+    alignment = align(scene.ms, scene.pan)
+    assert any("lie elsewhere" in warning for warning in alignment.warnings)
+    assert check(scene.ms, scene.pan).affine_enough is not True
