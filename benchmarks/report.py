@@ -9,8 +9,9 @@ from pathlib import Path
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE_HEAD = """# Benchmarks
 
-Every section is written by the command it names; `benchmarks/README.md` says how to run them.
-Errors are in PAN pixels over 21 × 21 check points of the MS raster, against the known truth.
+Tables are written by the commands they name, what they say and where the time goes by hand;
+`benchmarks/README.md` says how to run them. Errors, but for real pairs, are in PAN pixels over
+21 × 21 check points of the MS raster, against the known truth.
 """
 
 

@@ -173,7 +173,7 @@ def check(
         judge_misalignment(misalignment, limit_px),
         limit_px,
         misalignment,
-        is_affine_enough(misalignment, limit_px),
+        is_affine_enough(misalignment, limit_px, alignment.tie_points),
         alignment,
         tuple(bands) if per_band else None,
     )

@@ -56,7 +56,7 @@ _HEADING = """## Real pairs
 shift of MS against PAN in PAN px, column and row, by a windowed correlation that shares no code
 with the library (its noise is about 0.05 px; on the aerial and the small pairs the windows scatter
 by far more, as the median window shows). Tie points: the median distance of theirs from the
-correction, in PAN px."""
+fit, in PAN px."""
 NAIP = "naip/m_4709963_se_14_1_{}.tif"
 PAIRS: tuple[Pair, ...] = (
     Pair("landsat8_momotombo", "landsat8_momotombo/ms.tif", "landsat8_momotombo/pan.tif"),
@@ -94,7 +94,7 @@ PAIRS: tuple[Pair, ...] = (
 class Row:
     """One line of the table; offsets are MS content minus PAN content, in PAN pixels.
 
-    `residual_px` is the median distance of the tie points from the correction.
+    `residual_px` is the median distance of the tie points from the fit.
     """
 
     name: str

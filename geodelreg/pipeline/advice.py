@@ -41,14 +41,14 @@ def warnings_of(pair: Pair, solution: Solution) -> tuple[str, ...]:
             "the correction rotates the raster: its geotransform is no longer north-up, which "
             "GDAL's pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
         )
-    local = local_distortion(pair, solution)
+    local = local_distortion(solution.tie_points)
     if local > LOCAL_RMS_PX:
         notes.append(
             f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
             "(terrain, or bands that do not agree); a local warp would be needed"
         )
-    share, distance = elsewhere(solution.tie_points)
-    if share > _MANY_ELSEWHERE and distance > LOCAL_RMS_PX:
+    if many_elsewhere(solution.tie_points):
+        share, distance = elsewhere(solution.tie_points)
         notes.append(
             f"{share:.0%} of the patches that matched lie elsewhere, {distance:.2g} PAN px off in "
             "the median (terrain, clouds, or changes): the correction and its standard error are "
@@ -69,15 +69,20 @@ def elsewhere(points: TiePoints) -> tuple[float, float]:
     return share, float(np.median(np.hypot(*points.residual_px[away].T)))
 
 
-def local_distortion(pair: Pair, solution: Solution) -> float:
+def many_elsewhere(points: TiePoints) -> bool:
+    """True when so many patches lie elsewhere, and so far, that nobody knows who is right."""
+    share, distance = elsewhere(points)
+    return share > _MANY_ELSEWHERE and distance > LOCAL_RMS_PX
+
+
+def local_distortion(points: TiePoints) -> float:
     """RMS of what is left over smoothly, in PAN pixels; 0 when it is within the noise.
 
     Residuals are averaged over blocks; their variance beyond that of the noise is distortion.
-    NaN when there are too few tie points to tell, or too many of them lie elsewhere.
+    Of the tie points that agree; NaN when they are too few to tell.
     """
-    points = solution.tie_points
     kept = points.kept
-    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK or elsewhere(points)[0] > _MANY_ELSEWHERE:
+    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK:
         return float("nan")
     block = spatial_blocks(points.source_px[kept], _BLOCKS)
     residual = points.residual_px[kept]

@@ -8,11 +8,11 @@ import numpy as np
 
 from geodelreg.fit.gate import SIGNIFICANCE
 from geodelreg.fit.models import IDENTITY
-from geodelreg.pipeline.advice import LOCAL_RMS_PX, local_distortion
+from geodelreg.pipeline.advice import LOCAL_RMS_PX, local_distortion, many_elsewhere
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair
 from geodelreg.pipeline.tiles import overlap_corners, roles
-from geodelreg.types import CheckOutcome, Misalignment
+from geodelreg.types import CheckOutcome, Misalignment, TiePoints
 
 
 def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
@@ -29,7 +29,7 @@ def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
         distance_px=float(np.hypot(*moves.T).max()),
         distance_m=float(np.hypot(*(moves * np.array(pair.reference_gsd_m)).T).max()),
         sigma_px=solution.accuracy.sigma_corner_px,
-        local_px=local_distortion(pair, solution),
+        local_px=local_distortion(solution.tie_points),
     )
 
 
@@ -53,8 +53,13 @@ def judge_misalignment(misalignment: Misalignment, limit_px: float) -> CheckOutc
     return CheckOutcome.ALIGNED if doubt <= limit_px else CheckOutcome.CANNOT_TELL
 
 
-def is_affine_enough(misalignment: Misalignment, limit_px: float) -> bool | None:
-    """False when a local warp is needed for `limit_px`; None when nothing can be told."""
+def is_affine_enough(misalignment: Misalignment, limit_px: float, points: TiePoints) -> bool | None:
+    """False when a local warp is needed for `limit_px`; None when nothing can be told.
+
+    Nothing can, unless distorted, when few points agree or many lie elsewhere.
+    """
     if math.isnan(misalignment.local_px):
         return None
-    return misalignment.local_px <= min(LOCAL_RMS_PX, limit_px)
+    if misalignment.local_px > min(LOCAL_RMS_PX, limit_px):
+        return False
+    return None if many_elsewhere(points) else True

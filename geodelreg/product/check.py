@@ -199,7 +199,9 @@ def _motion_line(check: Check) -> str:
 
 def _local_line(check: Check) -> str:
     if check.affine_enough is None:
-        return "Too few tie points agree to tell whether one affine is enough."
+        return (
+            "Too few tie points agree, or too many lie elsewhere, to tell if one affine is enough."
+        )
     left = check.misalignment.local_px
     local = f"{short(left)} PAN px RMS of smooth distortion" if left else "no smooth distortion"
     if check.affine_enough:

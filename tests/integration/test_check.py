@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 import geodelreg
 from geodelreg.errors import UsageError
+from geodelreg.pipeline.advice import local_distortion, many_elsewhere
 from geodelreg.pipeline.check import is_affine_enough, judge_misalignment
 from geodelreg.product.check import check_dict, check_text
 from geodelreg.product.report import report_schema
-from geodelreg.types import CheckOutcome, Misalignment
+from geodelreg.types import CheckOutcome, FloatArray, Misalignment, Status, TiePoints
 from tests.cli.helpers import SAMPLES
 
 TRUTH = json.loads((SAMPLES / "truth.json").read_text(encoding="utf-8"))
@@ -125,6 +126,35 @@ def test_a_band_that_is_shifted_is_named(write_ms: WriteMs) -> None:
     jsonschema.validate(check_dict(found), report_schema())
 
 
+def points_of_relief(amplitude_px: float = 1.2, elsewhere_px: float = 3.0) -> TiePoints:
+    """600 tie points that agree on a wave, and 300 that lie elsewhere."""
+    rng = np.random.default_rng(0)
+    source: FloatArray = rng.uniform(0, 1000, (900, 2))
+    residual: FloatArray = rng.normal(0, 0.05, (900, 2))
+    residual[:, 0] += amplitude_px * np.sin(2 * np.pi * source[:, 1] / 1000)
+    residual[600:] = elsewhere_px
+    status = np.where(np.arange(900) < 600, Status.KEPT, Status.RESIDUAL).astype(np.uint8)
+    one, no = np.ones(900), np.zeros(900, dtype=bool)
+    return TiePoints(source, source, np.tile(np.eye(2), (900, 1, 1)), one, status, no, residual)
+
+
+def test_distortion_counts_although_many_lie_elsewhere() -> None:
+    points = points_of_relief()
+    off = Misalignment(0.1, 1.0, 0.05, local_distortion(points))
+    assert off.local_px == pytest.approx(1.2 / np.sqrt(2), rel=0.15)
+    assert judge_misalignment(off, 0.5) is CheckOutcome.MISALIGNED
+    assert is_affine_enough(off, 0.5, points) is False
+
+
+def test_many_elsewhere_leave_open_whether_an_affine_is_enough() -> None:
+    points, near = points_of_relief(0.0), points_of_relief(0.0, elsewhere_px=0.1)
+    flat = Misalignment(0.1, 1.0, 0.05, local_distortion(points))
+    assert many_elsewhere(points)
+    assert is_affine_enough(flat, 0.5, points) is None
+    assert not many_elsewhere(near)
+    assert is_affine_enough(flat, 0.5, near) is True
+
+
 @pytest.mark.parametrize("amplitude_ms_px", [0.15, 0.5])
 def test_a_bent_image_never_passes_for_aligned(write_ms: WriteMs, amplitude_ms_px: float) -> None:
     def bend(bands: Pixels) -> Pixels:
@@ -147,14 +177,15 @@ def test_distortion_that_is_left_is_said_and_counts(write_ms: WriteMs) -> None:
         found,
         misalignment=off,
         raster_outcome=judge_misalignment(off, found.limit_px),
-        affine_enough=is_affine_enough(off, found.limit_px),
+        affine_enough=is_affine_enough(off, found.limit_px, found.alignment.tie_points),
     )
     assert bent.outcome is CheckOutcome.MISALIGNED
     assert bent.reason == "0.800 PAN px RMS of local distortion"
     assert "One affine is not enough: it leaves 0.800 PAN px RMS" in check_text(bent)
     assert check_dict(bent)["check"]["affine_enough"] is False
-    assert is_affine_enough(off, 2.0) is False
-    assert is_affine_enough(replace(off, local_px=0.25), 0.2) is False
+    assert is_affine_enough(off, 2.0, found.alignment.tie_points) is False
+    bent_less = replace(off, local_px=0.25)
+    assert is_affine_enough(bent_less, 0.2, found.alignment.tie_points) is False
 
 
 def test_the_tolerance_of_align_hides_nothing(write_ms: WriteMs) -> None:
@@ -165,7 +196,7 @@ def test_the_tolerance_of_align_hides_nothing(write_ms: WriteMs) -> None:
 
 def test_unknown_without_evidence() -> None:
     assert judge_misalignment(Misalignment(), 0.5) is CheckOutcome.CANNOT_TELL
-    assert is_affine_enough(Misalignment(), 0.5) is None
+    assert is_affine_enough(Misalignment(), 0.5, points_of_relief()) is None
 
 
 @pytest.mark.parametrize(
