@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -107,14 +107,17 @@ def test_nothing_found_is_a_refusal() -> None:
 
 @settings(max_examples=300)
 @given(st.integers(1, 3000), st.floats(0, 1), st.floats(0.02, 0.9))
+@example(192, 0.9765625, 0.02)
 def test_binomial_tail_is_scipys(trials: int, share: float, probability: float) -> None:
     """An upper bound, and a tight one where it counts."""
     successes = round(share * trials)
     exact = stats.binom.logsf(successes - 1, trials, probability) / math.log(10)
     found = log10_binomial_tail(successes, trials, probability)
     assert found <= 0
+    if exact < -300:
+        return  # a subnormal number to scipy, with few digits
     assert found >= exact - 1e-6 * max(1, abs(exact))
-    if -300 < exact < -4:
+    if exact < -4:
         assert found == pytest.approx(exact, abs=0.15)
 
 
