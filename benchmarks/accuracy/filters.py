@@ -82,7 +82,7 @@ def by_star(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> Boo
 
 
 def by_shared_edges(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> BoolArray:
-    """Edges that both triangulations share: step 6 of Zhang et al. 2013, once."""
+    """Edges that both triangulations share: our reading of step 6 of Zhang et al. 2013, once."""
     status = reject_unshared(source, reference, ratio, initial_status(ratio), 0.2)
     return np.asarray(status == Status.KEPT)
 

@@ -1,12 +1,14 @@
 """The paper's method, step by step, and its "traditional SIFT" baseline.
 
-Zhang, Ma & Zhang, "A Quick Image Registration Algorithm Based on Delaunay Triangulation",
-TELKOMNIKA 11(2), 2013, 761–773.  Each numbered step of section 2 there is one function over
-``(source_xy, reference_xy, ratio, status)``.  A step returns a new status array: points are never
-dropped, and only kept ones are looked at.  Step 1 is `geodelreg.match.keypoints.detect` with plain
-descriptors (``root=False``), step 7 the least-squares affine of `geodelreg.fit`.
+Yongmei Zhang, Li Ma, Rui Zhang, "A Quick Image Registration Algorithm Based on Delaunay
+Triangulation", TELKOMNIKA 11(2), 2013, 761–773.  Each numbered step of section 2 there is one
+function over ``(source_xy, reference_xy, ratio, status)``.  A step returns a new status array:
+points are never dropped, and only kept ones are looked at.  Step 1 is
+`geodelreg.match.keypoints.detect` with `lowe_options`, step 7 plain least squares.
 
-Where the paper is loose, the choice made here is a documented option.
+Where the paper is loose, the choice made here is a documented option.  Of step 6 it says only that
+the correspondence of the triangulations and the distance ratio keep homologous pairs: both criteria
+here are our reading.  `AS_PRINTED` is the method without them.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from geodelreg.geo.triangulation import (
     relative_altitude,
 )
 from geodelreg.match.descriptors import match_descriptors, matched_xy, one_to_one, ratio_test
+from geodelreg.match.keypoints import OCTAVE_LAYERS, KeypointOptions
 from geodelreg.types import (
     BoolArray,
     FloatArray,
@@ -34,6 +37,12 @@ from geodelreg.types import (
 )
 
 StatusArray = NDArray[np.uint8]
+
+LOWE_CONTRAST = 0.03
+"""Least contrast of a keypoint on a grey scale of 0 to 1 (Lowe 2004, section 4)."""
+
+_ONE_CELL = 10**9
+"""Keypoints to a cell of the grid that spreads them: so many that the image is one cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +61,11 @@ class ZhangOptions:
         the sum of the opposite angles) of two adjacent triangles is less than this; 0 switches the
         step off.
     final_ratio : float
-        Step 6: descriptor distance ratio asked of the survivors; 1 switches the test off.
+        Step 6, our reading: descriptor distance ratio asked of the survivors; 1 switches the test
+        off.
     min_shared_edges : float
-        Step 6: smallest share of a point's edges that both triangulations have (shared edges over
-        the edges it has in either one); 0 switches the test off.
+        Step 6, our reading: smallest share of a point's edges that both triangulations have (shared
+        edges over the edges it has in either one); 0 switches the test off.
     sigma_px : float
         Standard deviation of a SIFT position, in pixels of the keypoints' image, per axis.
     """
@@ -68,6 +78,23 @@ class ZhangOptions:
     sigma_px: float = 0.3
 
 
+AS_PRINTED = ZhangOptions(final_ratio=1.0, min_shared_edges=0.0)
+"""Steps 2 to 5 alone, without our reading of step 6."""
+
+
+def lowe_options(max_keypoints: int) -> KeypointOptions:
+    """Step 1 as in Lowe 2004: his contrast threshold, plain descriptors, no spreading.
+
+    His image has no limit on the number of keypoints; here the strongest stay.
+
+    Parameters
+    ----------
+    max_keypoints : int
+    """
+    contrast = LOWE_CONTRAST * OCTAVE_LAYERS  # OpenCV divides its threshold by the layers
+    return KeypointOptions(max_keypoints, contrast, contrast, _ONE_CELL, root=False)
+
+
 def match_zhang2013(
     source: Keypoints, reference: Keypoints, options: ZhangOptions | None = None
 ) -> tuple[TiePoints, dict[str, int]]:
@@ -76,7 +103,7 @@ def match_zhang2013(
     Parameters
     ----------
     source, reference : Keypoints
-        Step 1: plain SIFT (``KeypointOptions(root=False)``).
+        Step 1, by `lowe_options`.
     options : ZhangOptions, optional
 
     Returns
@@ -135,7 +162,7 @@ def reject_ambiguous(
     status: StatusArray,
     limit: float,
 ) -> StatusArray:
-    """Step 2, and again in step 6: the ratio test of Lowe 2004.
+    """Step 2, and again in our reading of step 6: the ratio test of Lowe 2004.
 
     Parameters
     ----------
@@ -238,7 +265,7 @@ def reject_unshared(
     status: StatusArray,
     min_shared_edges: float,
 ) -> StatusArray:
-    """Step 6: points whose edges the two triangulations do not share become `Status.TOPOLOGY`.
+    """Step 6, our reading: points whose edges the triangulations do not share: `Status.TOPOLOGY`.
 
     A homologous pair has the same neighbours in both triangulations, but for neighbours that are
     mismatched themselves.

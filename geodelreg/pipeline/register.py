@@ -18,7 +18,7 @@ from geodelreg.match.area import best_shift
 from geodelreg.match.surface import make_surface
 from geodelreg.options import AlignOptions
 from geodelreg.pipeline.advice import warnings_of
-from geodelreg.pipeline.baseline import solve_baseline
+from geodelreg.pipeline.baseline import PaperFit, paper_fits, paper_scopes, solve_baseline
 from geodelreg.pipeline.evidence import overlay
 from geodelreg.pipeline.search import (
     SURE_LOG_NFA,
@@ -63,7 +63,8 @@ def register(
     """Find the correction of the source's header, with its evidence.
 
     Hypotheses come from keypoints, coarse first, then from area correlation around the header; each
-    is refined and judged, and the first that the evidence supports is taken.
+    is refined and judged, and the first that the evidence supports is taken.  Fits of the paper's
+    methods are judged as they are.
 
     Parameters
     ----------
@@ -98,8 +99,10 @@ def register(
         found = perf_counter() - start
         if affine_from_matrix(hypothesis.matrix).is_degenerate:
             continue  # of headers that squeeze the ground to a line
-        run = solve if options.method == "delaunay" else solve_baseline
-        solution = run(seen, hypothesis)
+        if isinstance(hypothesis, PaperFit):
+            solution = solve_baseline(seen, hypothesis)
+        else:
+            solution = solve(seen, hypothesis)
         if solution is not None:
             read_s = hypothesis.pair.read_s
             solution = _finish(seen, solution, {"read": read_s, "search": found - read_s})
@@ -119,6 +122,8 @@ def register(
 def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
     """First guesses, the most likely first; later ones are only computed when needed.
 
+    The paper's methods make none: theirs are finished fits.
+
     Yields
     ------
     pair : Pair
@@ -128,7 +133,8 @@ def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
     by_area: list[tuple[Pair, WorkingPair]] = []
     empty: NoDataError | None = None
     read_s = 0.0
-    for scope in scopes(pair):
+    is_paper = pair.options.method != "delaunay"
+    for scope in paper_scopes(pair) if is_paper else scopes(pair):
         seen, images = _with_content(pair, read_working_pair(pair, scope, read_s))
         read_s = images.read_s
         empty = _emptiness(pair, images)
@@ -136,9 +142,9 @@ def hypotheses(pair: Pair) -> Iterator[tuple[Pair, Hypothesis]]:
             continue
         if not by_area:
             by_area.append((seen, images))
-        for hypothesis in keypoint_hypotheses(seen, images):
+        for hypothesis in (paper_fits if is_paper else keypoint_hypotheses)(seen, images):
             yield seen, hypothesis
-    for seen, images in by_area if pair.options.method == "delaunay" else []:
+    for seen, images in [] if is_paper else by_area:
         yield seen, area_hypothesis(seen, images)
     if empty is not None and not by_area:
         raise empty

@@ -7,12 +7,14 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
 from affine import Affine
 from rasterio.transform import from_gcps
 from rasterio.vrt import WarpedVRT
+from scipy.spatial import KDTree
 
 import geodelreg
 from benchmarks.accuracy.measure import MeasureOptions, measure_offsets, read_raster
@@ -238,6 +240,33 @@ def test_the_papers_methods_run_and_are_judged(sample: Scene, method: str) -> No
     assert points[0] == counts[0][1]
     assert points[-1] == found.tie_points.kept.sum() > 100
     assert found.correction.model in ("affine", "none")
+
+
+def test_the_papers_methods_start_from_lowes_keypoints(tmp_path: Path) -> None:
+    """All that his threshold leaves, wherever they lie, at the resolution of the coarser raster."""
+    scene = make_scene(tmp_path, Recipe(centred(1, 400), (400, 400)))
+    with rasterio.open(scene.pan) as raster:
+        pan = raster.read(1).astype(np.float32)
+    low, high = np.percentile(pan, (0.5, 99.5))
+    grey = np.rint(np.clip((pan - low) * (255 / (high - low)), 0, 255)).astype(np.uint8)
+    # OpenCV's documentation: Lowe's 0.03 is 0.09 here
+    sift = cv2.SIFT.create(contrastThreshold=0.09, enable_precise_upscale=True)
+    places = np.array([point.pt for point in sift.detect(grey, None)]) + 0.5
+    found = judged(scene, "sift")
+    assert found.step_counts["keypoints PAN"] == len(places) > 1000
+    assert KDTree(places).query(found.tie_points.reference_px)[0].max() < 1e-3
+
+
+def test_the_papers_fit_is_plain_least_squares_of_its_points(tmp_path: Path) -> None:
+    scene = make_scene(tmp_path, Recipe(centred(4, 130), (130, 130)))
+    found = geodelreg.align(scene.ms, scene.pan, AlignOptions(method="zhang2013"))
+    points, header = found.tie_points, Affine(*scene.truth.ms_header)
+    source = points.source_px[points.kept]
+    x, y = ~header @ Affine(*scene.truth.pan) @ tuple(points.reference_px[points.kept].T)
+    rows = np.column_stack([source, np.ones(len(source))])
+    across, down = np.linalg.lstsq(rows, np.column_stack([x, y]), rcond=None)[0].T
+    expected = header @ Affine(*across, *down)
+    assert np.allclose(found.correction.corrected[:6], expected[:6], rtol=0, atol=1e-5)
 
 
 def test_the_papers_filter_beats_plain_sift(tmp_path: Path) -> None:

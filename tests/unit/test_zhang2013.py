@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from geodelreg.geo.triangulation import incircle_sine, interior_edges, relative_altitude
-from geodelreg.match.keypoints import KeypointOptions, detect
+from geodelreg.match.keypoints import detect
 from geodelreg.match.zhang2013 import (
+    AS_PRINTED,
     ZhangOptions,
     initial_status,
+    lowe_options,
     match_sift,
     match_zhang2013,
     reject_ambiguous,
@@ -138,9 +140,24 @@ def scene_keypoints() -> tuple[Keypoints, Keypoints]:
     keypoints = []
     for image in (source, reference):
         noisy = np.clip(image + 4 * rng.standard_normal(image.shape), 0, 255).astype(np.uint8)
-        options = KeypointOptions(max_keypoints=1500, root=False)
-        keypoints.append(detect(noisy, np.ones(noisy.shape, np.bool_), options))
+        keypoints.append(detect(noisy, np.ones(noisy.shape, np.bool_), lowe_options(1500)))
     return keypoints[0], keypoints[1]
+
+
+@pytest.mark.parametrize("shape", [(300, 300), (150, 600)])
+def test_of_too_many_keypoints_the_strongest_stay_wherever_they_are(
+    shape: tuple[int, int],
+) -> None:
+    """OpenCV's own selection, on an image whose right half has most of the contrast."""
+    rng = np.random.default_rng(3)
+    image = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), 2.0)
+    image[:, : shape[1] // 2] *= 0.6
+    grey = np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)
+    sift = cv2.SIFT.create(nfeatures=100, contrastThreshold=0.09, enable_precise_upscale=True)
+    strength = sorted(point.response for point in sift.detect(grey, None))
+    found = detect(grey, np.ones(shape, np.bool_), lowe_options(100))
+    assert len(found) == 100
+    assert np.allclose(np.sort(found.response), strength[-100:])
 
 
 def test_whole_method_on_images(scene_keypoints: tuple[Keypoints, Keypoints]) -> None:
@@ -177,6 +194,13 @@ def test_traditional_sift_is_the_ratio_test_alone(
     assert list(counts) == ["nearest", "ratio"]
     assert counts["ratio"] == zhang_counts["ratio"] == tie_points.kept.sum()
     assert set(tie_points.status.tolist()) == {Status.KEPT, Status.RATIO}
+
+
+def test_as_printed_stops_after_step_5(scene_keypoints: tuple[Keypoints, Keypoints]) -> None:
+    tie_points, counts = match_zhang2013(*scene_keypoints, AS_PRINTED)
+    _, read = match_zhang2013(*scene_keypoints)
+    assert tie_points.kept.sum() == counts["corresponding"] == read["not_cocircular"]
+    assert read["corresponding"] < read["not_cocircular"]
 
 
 def test_each_step_can_be_switched_off(scene_keypoints: tuple[Keypoints, Keypoints]) -> None:
