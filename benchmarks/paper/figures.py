@@ -10,8 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from scipy import ndimage
 
-from benchmarks.paper.methods import METHODS, STEPS, Matched, Stage, match_plainly, run_steps
+from benchmarks.paper.methods import (
+    METHODS,
+    STEPS,
+    STEPS_OF,
+    Matched,
+    Stage,
+    corrections,
+    match_plainly,
+    run_steps,
+    true_rmse,
+)
 from benchmarks.paper.page import CONTAMINATION, MEASURES, effect, group, spread_of
 from benchmarks.paper.scenes import Case
 from geodelreg.geo.triangulation import delaunay
@@ -21,13 +32,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Row = dict[str, Any]
-COLOURS = dict(zip(METHODS, ("#d1495b", "#edae49", "#66a182", "#1f4e79"), strict=True))
-MARKERS = dict(zip(METHODS, "os^*", strict=True))
+COLOURS = dict(zip(METHODS, ("#d1495b", "#e07a3f", "#edae49", "#66a182", "#1f4e79"), strict=True))
+MARKERS = dict(zip(METHODS, "oDs^*", strict=True))
 RIGHT, WRONG, MESH = "#ffcf33", "#ff3b3b", "#35d0ff"
 LINES_AT_MOST = 60
 FINE_MESH = 600
-PALETTE = 64
+PALETTE = 128
 WORST_PX = 1000.0
+BOARD_CELLS = 8
+MS_TINT = np.array([0.75, 0.88, 1.0])
+Registered = list[tuple[str, FloatArray]]
 
 
 def save(figure: Figure, path: Path, dpi: int = 110) -> None:
@@ -38,11 +52,13 @@ def save(figure: Figure, path: Path, dpi: int = 110) -> None:
     figure.savefig(buffer, dpi=dpi, metadata={"Software": None})
     path.parent.mkdir(parents=True, exist_ok=True)
     image = Image.open(buffer).convert("RGB")
-    image.quantize(PALETTE, dither=Image.Dither.NONE).save(path, optimize=True)
+    # this method keeps rare colours, as those of a few wrong matches
+    few = image.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
 
 
 def draw_matches(stage: Stage, case: Case, path: Path) -> None:
-    """Figs. 4 to 7 of the paper: matches before and after its Delaunay steps, on both images.
+    """Figs. 4 to 7 of the paper: the matches that each of its methods keeps, on both images.
 
     Parameters
     ----------
@@ -52,13 +68,8 @@ def draw_matches(stage: Stage, case: Case, path: Path) -> None:
     path : Path
     """
     matched, _ = match_plainly(stage)
-    figure = Figure(figsize=(9.0, 9.4), layout="constrained")
-    rows = figure.subplots(2, 1)
-    for axes, (title, steps) in zip(
-        rows,
-        (("after steps 2 and 3", ["3 one-to-one"]), ("after steps 4 to 6", list(STEPS))),
-        strict=True,
-    ):
+    figure = Figure(figsize=(6.6, 10.4), layout="constrained")
+    for axes, (title, steps) in zip(figure.subplots(3, 1), STEPS_OF.items(), strict=True):
         kept = run_steps(matched, steps)[0] == Status.KEPT
         _draw_pair(axes, stage, matched, kept)
         wrong = int((kept & ~matched.right).sum())
@@ -66,7 +77,7 @@ def draw_matches(stage: Stage, case: Case, path: Path) -> None:
     what = {"rotation": f", {case.value:g}°", "translation": f", {case.value:g} px"}
     figure.suptitle(
         f"{case.condition}{what.get(case.condition, '')} ({case.source}, {case.ratio:g}:1): "
-        "MS left, PAN right; right matches yellow, wrong ones red",
+        "MS left, PAN right;\nright matches yellow, wrong ones red",
         fontsize=10,
     )
     save(figure, path, 80)
@@ -105,6 +116,49 @@ def _grey(band: Band) -> FloatArray:
     image = np.clip((band.data - low) / max(high - low, 1e-9), 0, 1) ** 0.7
     # few grey levels: colour is for the matches, and the file stays small
     return np.asarray(np.round(image * 14) / 14, dtype=np.float64)
+
+
+def registered_images(stage: Stage) -> Registered:
+    """Figs. 4 to 7 (i) of the paper: MS as each method registers it, on a board with PAN.
+
+    Returns
+    -------
+    list of (str, (H, W, 3) float64)
+        A title, and squares of MS (blue) and of PAN (grey) by turns, on PAN's grid.
+    """
+    pair, pan = stage.pair, stage.images.reference
+    ms = stage.images.source[1 % len(stage.images.source)]
+    to_pan = ~pair.reference.grid.transform @ pan.grid.transform
+    to_ms = ~ms.grid.transform @ pair.source.grid.transform
+    rows, columns = np.indices(pan.data.shape)
+    places = np.stack(to_pan @ (columns + 0.5, rows + 0.5), axis=-1)
+    square = max(pan.data.shape) / BOARD_CELLS
+    odd = ((rows // square + columns // square) % 2).astype(bool)
+    found: Registered = []
+    for method, matrix in corrections(stage).items():
+        board = np.repeat(_grey(pan)[:, :, None], 3, axis=2)
+        if matrix is not None:
+            x, y = to_ms @ tuple(np.moveaxis(pair.to_source(matrix, places), -1, 0))
+            index = [y - 0.5, x - 0.5]
+            grey = ndimage.map_coordinates(_grey(ms), index, order=1, cval=np.nan)
+            board[odd] = grey[odd, None] * MS_TINT
+        title = f"{method}: {true_rmse(stage, matrix):.2g} px off"
+        found.append((title, np.nan_to_num(board, nan=1.0)))
+    return found
+
+
+def draw_registered(rows: dict[str, Registered], path: Path) -> None:
+    """The registered images of all figures, a line for each."""
+    figure = Figure(figsize=(9.6, 7.6), layout="constrained")
+    grid = figure.subplots(len(rows), len(next(iter(rows.values()))), squeeze=False)
+    for line, (name, images) in zip(grid, rows.items(), strict=True):
+        for axes, (title, board) in zip(line, images, strict=True):
+            axes.imshow(board, vmin=0, vmax=1)
+            axes.set_title(title, fontsize=7)
+            axes.set_xticks([])
+            axes.set_yticks([])
+        line[0].set_ylabel(f"{name} (i)")
+    save(figure, path, 80)
 
 
 def draw_sweeps(rows: list[Row], folder: Path) -> None:

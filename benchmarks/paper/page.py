@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.paper.ablation import ALL, MESH, NONE, interval
-from benchmarks.paper.methods import METHODS, OURS, SIFT, STEPS, ZHANG
-from benchmarks.paper.scenes import CLEAN, CLOUDS, DATES, REAL, SAMPLE, SEASON
+from benchmarks.paper.methods import GATED, METHODS, OURS, PRINTED, READ, SIFT, STEPS, STEPS_OF
+from benchmarks.paper.scenes import CLEAN, CLOUDS, DATES, FIGURES, REAL, SAMPLE, SEASON, Case
 from benchmarks.report import replace_section
 
 Row = dict[str, Any]
@@ -22,6 +23,14 @@ GROUPS: tuple[tuple[str, float], ...] = (
 )  # fmt: skip
 CONTAMINATION = (CLEAN, CLOUDS, SEASON, DATES, REAL)
 ACCURATE_PX = 1.0
+SHOWN = (SIFT, PRINTED, READ, OURS)
+NOT_GIVEN = ("–", "–")
+PRINTED_FIGURES = {
+    "Fig 4, 5": {"time, s": ("0.215", "0.2098"), "RMSE": ("0.6808", "0.6524")},
+    "Fig 6": {"time, s": ("0.1696", "0.1498"), "RMSE": ("0.8733", "0.7452")},
+    "Fig 7": {"time, s": ("0.6935", "0.5863"), "RMSE": ("0.8952", "0.7558")},
+}
+"""What the paper gives: with traditional SIFT and with its method."""
 
 
 def group(rows: Iterable[Row], condition: str, ratio: float | None = None) -> list[Row]:
@@ -95,12 +104,51 @@ def steps_table(rows: list[Row]) -> str:
     for condition, ratio in GROUPS:
         part = group(rows, condition, ratio)
         if part:
-            counts = [row["methods"][ZHANG]["steps"] for row in part]
+            counts = [row["methods"][READ]["steps"] for row in part]
             medians = [np.median([count[name] for count in counts]) for name in names]
             wrong = 100 * np.median([row["wrong_share"] for row in part])
             pairs = f"{condition}, {ratio:g}:1"
             lines.append([pairs, *(f"{m:.0f}" for m in medians), f"{wrong:.0f}"])
     return _table(["pairs", *names, "wrong after step 2, %"], lines)
+
+
+def figures_table(results: Results) -> str:
+    """The numbers of the paper's Figures 4 to 7 beside those of the pairs that stand for them."""
+    lines = []
+    for name, case in FIGURES.items():
+        row = _row_of(case, [*results["pairs"], *results["sweeps"]])
+        given = PRINTED_FIGURES[name]
+        scores = [row["methods"][method] for method in SHOWN]
+        cells: dict[str, tuple[tuple[str, str], list[str]]] = {
+            "points after steps 2 → 3 → 5 → 6": (NOT_GIVEN, [_chain(row, m) for m in SHOWN]),
+            "correct rate, %": (NOT_GIVEN, [f"{correct_rate(row, m):.1f}" for m in SHOWN]),
+            "time, s": (given["time, s"], [f"{s['cpu_s']:.2f}" for s in scores]),
+            "the paper's RMSE": (given["RMSE"], [""] * len(SHOWN)),
+            "RMSE at control points, px": (
+                NOT_GIVEN, [f"{s['control_rmse_px']:.3g}" for s in scores],
+            ),
+            "E1, DN": (NOT_GIVEN, [f"{s['e1']:.3g}" for s in scores]),
+            "true RMSE, px": (NOT_GIVEN, [f"{s['true_rmse_px']:.3g}" for s in scores]),
+        }  # fmt: skip
+        for quantity, (theirs, mine) in cells.items():
+            first = name if quantity.startswith("points") else ""
+            lines.append([first, quantity, *theirs, *mine])
+    head = ["figure", "", "printed: SIFT", "printed: Delaunay", *SHOWN]
+    return _table(head, lines)
+
+
+def _row_of(case: Case, rows: Iterable[Row]) -> Row:
+    """The row that was measured of a case."""
+    return next(r for r in rows if all(r[k] == v for k, v in asdict(case).items()))
+
+
+def _chain(row: Row, method: str) -> str:
+    """Points left after the ratio test and after each step that a method has."""
+    score = row["methods"][method]
+    if method not in STEPS_OF:
+        return f"{score['kept']} patches"
+    last = {name.split()[0]: name for name in ("2 ratio", *STEPS_OF[method])}
+    return " → ".join(str(score["steps"][name]) for name in last.values())
 
 
 def within_table(rows: list[Row]) -> str:
@@ -124,14 +172,14 @@ def gate_table(rows: list[Row]) -> str:
     lines = []
     for condition in (SAMPLE, *CONTAMINATION):
         cells = [condition]
-        for method in (SIFT, ZHANG, OURS):
+        for method in GATED:
             scores = [row["methods"][method] for row in group(rows, condition)]
             asked = [s for s in scores if s["outcome"]]
             taken = [s for s in asked if s["outcome"] in ("aligned", "already_aligned")]
             false = sum(not s["accepted_rmse_px"] <= ACCURATE_PX for s in taken)
             cells.append(f"{len(taken)} of {len(asked)} accepted, {false} of them > 1 px")
         lines.append(cells)
-    return _table(["pairs", SIFT, ZHANG, OURS], lines)
+    return _table(["pairs", *GATED], lines)
 
 
 def ablation_table(rows: list[Row], condition: str) -> str:
@@ -253,6 +301,7 @@ def sections(results: Results) -> dict[str, str]:
     count = f"{len(pairs)} pairs, {results['cpu_min']:.0f} CPU minutes, {results['machine']}"
     return {
         "table": f"{headline(pairs)}\n\nMeasured on {count}.",
+        "figures": figures_table(results),
         "steps": steps_table(pairs),
         "within": within_table(pairs),
         "gate": gate_table(pairs),

@@ -17,7 +17,7 @@ from affine import Affine
 
 from benchmarks.paper import methods
 from benchmarks.paper.ablation import ablate
-from benchmarks.paper.scenes import Case, cases, make_pair, sweep_cases
+from benchmarks.paper.scenes import FIGURES, Case, cases, make_pair, sweep_cases
 from benchmarks.report import machine
 from benchmarks.scenes.imagery import ImageryNotFoundError
 from benchmarks.scenes.make import write_scene
@@ -26,12 +26,6 @@ from geodelreg.image.reader import open_raster
 from geodelreg.types import Status
 
 SEEDS, QUICK_SEEDS = 3, 1
-# The paper's Fig. 4 and 5 (an ordinary pair), 6 and 7.
-FIGURES = {
-    "paper_fig4_5": Case("two dates", "landsat8_twodates", 1.0, 0),
-    "paper_fig6": Case("rotation", "sentinel2", 1.0, 0, 36.0),
-    "paper_fig7": Case("translation", "sentinel2", 1.0, 0, 230.0),
-}
 Row = dict[str, Any]
 
 
@@ -60,7 +54,7 @@ def compare(stage: methods.Stage, with_gate: bool) -> tuple[dict[str, Row], meth
     matched, keypoints = methods.match_plainly(again)
     shared_s = process_time() - start
     found = {}
-    for name, steps in ((methods.SIFT, ()), (methods.ZHANG, tuple(methods.STEPS))):
+    for name, steps in methods.STEPS_OF.items():
         start = process_time()
         status, counts = methods.run_steps(matched, steps)
         spent = shared_s + process_time() - start
@@ -73,7 +67,7 @@ def compare(stage: methods.Stage, with_gate: bool) -> tuple[dict[str, Row], meth
     found[methods.MESH] = methods.score_keypoints(stage, matched, kept, keypoints | counts, spent)
     found[methods.OURS] = methods.score_ours(stage)
     rows = {name: asdict(score) for name, score in found.items()}
-    for name in (methods.SIFT, methods.ZHANG) if with_gate else ():
+    for name in (methods.SIFT, methods.READ) if with_gate else ():
         rows[name]["outcome"], rows[name]["accepted_rmse_px"] = methods.gate_on(stage, name)
     return rows, matched
 
@@ -138,8 +132,12 @@ def run(args: argparse.Namespace) -> int:
         images = args.docs.parent / "images"
         figures.draw_sweeps(results["sweeps"], images)
         figures.draw_ablation(results["pairs"], images / "paper_ablation.png")
-        for name, case in FIGURES.items():
+        registered = {}
+        for title, case in FIGURES.items():
             with staged(case, args.data) as stage:
-                figures.draw_matches(stage, case, images / f"{name}.png")
+                name = title.lower().replace(" ", "").replace(",", "_")
+                figures.draw_matches(stage, case, images / f"paper_{name}.png")
+                registered[title] = figures.registered_images(stage)
+        figures.draw_registered(registered, images / "paper_registered.png")
         page.write(results, args.docs)
     return 0

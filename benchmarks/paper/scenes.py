@@ -61,6 +61,14 @@ class Case:
         return f"paper/{self.condition}/{self.source}/{self.ratio:g}/{self.seed}/{self.value:g}"
 
 
+FIGURES = {
+    "Fig 4, 5": Case(DATES, "landsat8_twodates", 1.0, 0),
+    "Fig 6": Case("rotation", "sentinel2", 1.0, 0, 36.0),
+    "Fig 7": Case("translation", "sentinel2", 1.0, 0, 230.0),
+}
+"""What stands in for the images of the paper's figures: an ordinary pair, 36° and 230 px."""
+
+
 def cases(seeds: int) -> list[Case]:
     """Every condition, source and GSD ratio, `seeds` times, and the sample pair once."""
     found = [Case(SAMPLE, "sample_tiles", 4.0, 0)]

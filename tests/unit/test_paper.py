@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from affine import Affine
 from pyproj import CRS
 
-from benchmarks.paper import methods
 from benchmarks.paper.ablation import ALL, NONE, compositions, interval
 from benchmarks.paper.methods import (
+    PRINTED,
+    READ,
+    SIFT,
     STEPS,
+    STEPS_OF,
     Matched,
     Stage,
     distinct_right,
@@ -28,8 +32,8 @@ from benchmarks.paper.methods import (
 from benchmarks.paper.scenes import crop_pan
 from benchmarks.scenes.make import Scene
 from benchmarks.scenes.truth import Truth
-from geodelreg.match.keypoints import KeypointOptions, detect
-from geodelreg.match.zhang2013 import match_sift, match_zhang2013
+from geodelreg.match.zhang2013 import AS_PRINTED, ZhangOptions, match_sift, match_zhang2013
+from geodelreg.pipeline.baseline import grey_keypoints
 from geodelreg.types import Band, Float32Array, Grid, Status, Window
 
 UTM18 = CRS.from_epsg(32618).to_wkt()
@@ -79,19 +83,21 @@ def matched(stage: Stage) -> Matched:
     return match_plainly(stage)[0]
 
 
-def test_all_steps_are_the_librarys_method_and_none_its_baseline(
-    stage: Stage, matched: Matched
+@pytest.mark.parametrize(
+    ("method", "library", "options"),
+    [
+        (SIFT, match_sift, ZhangOptions()),
+        (PRINTED, match_zhang2013, AS_PRINTED),
+        (READ, match_zhang2013, ZhangOptions()),
+    ],
+)
+def test_steps_of_each_method_are_the_librarys(
+    stage: Stage, matched: Matched, method: str, library: Any, options: ZhangOptions
 ) -> None:
-    band, pan = stage.images.source[0], stage.images.reference
-    options = KeypointOptions(root=False)
-    keypoints = [
-        detect(methods.to_uint8(b), b.valid, options) for b in (methods.mean_band([band]), pan)
-    ]
-    for names, library in ((tuple(STEPS), match_zhang2013), ((), match_sift)):
-        points, counts = library(*keypoints)
-        status, steps = run_steps(matched, names)
-        assert np.array_equal(status, points.status)
-        assert list(steps.values()) == list(counts.values())[1:]
+    points, counts = library(*grey_keypoints(stage.images), options)
+    status, steps = run_steps(matched, STEPS_OF[method])
+    assert np.array_equal(status, points.status)
+    assert list(steps.values()) == list(counts.values())[1 : 1 + len(steps)]
 
 
 def test_compositions_leave_out_and_add_each_step_once() -> None:
