@@ -20,7 +20,10 @@ COMMANDS = {
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
     "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),
-    "fuzz": ("benchmarks.robustness.fuzz", "mutated inputs: no crash, hang or half-written file"),
+    "fuzz": (
+        "benchmarks.robustness.fuzz",
+        "broken and hostile inputs: no crash, no hang, nothing that was not asked for",
+    ),
     "kills": (
         "benchmarks.robustness.kills",
         "kill -9 at random times: old or new files, nothing between",

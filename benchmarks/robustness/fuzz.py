@@ -1,7 +1,9 @@
-"""Mutated inputs against the library: nothing may crash, hang, grow or break a promise.
+"""Mutated and hostile inputs against the library: nothing may crash, hang, grow or get out.
 
-Warm worker processes run numbered cases (`benchmarks.robustness.fuzz_cases`); this process watches
-their time and memory, and replaces one that dies.
+Warm worker processes run numbered cases: mutations (`benchmarks.robustness.fuzz_cases`) and files,
+folders and names that mean harm (`benchmarks.robustness.hostile`). This process makes the latter,
+watches what comes of both (`benchmarks.robustness.witness`), their time and their memory, and
+replaces a worker that dies.
 """
 
 from __future__ import annotations
@@ -12,18 +14,29 @@ import math
 import multiprocessing
 import os
 import shutil
-import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from benchmarks.processes import ROOT, own_environment
 from benchmarks.records import Row, resume
 from benchmarks.report import replace_section
+from benchmarks.robustness.hostile.families import is_hostile, prepare
+from benchmarks.robustness.hostile.plan import Plan
+from benchmarks.robustness.witness import (
+    Facts,
+    LoopbackServer,
+    Snapshot,
+    Trace,
+    judge,
+    snapshot,
+)
 
 HANG_S = 30.0
 """Of CPU time, for the machine may be busy."""
@@ -31,45 +44,14 @@ HANG_S = 30.0
 WAIT_S = 300.0
 """Of wall time, for a case that waits for something."""
 
+HOSTILE_WAIT_S = 40.0
+"""Of wall time, for a hostile case: it is small, and what it waits for never comes."""
+
 LARGEST_RSS = 1_500_000_000
-_ADDRESS_SPACE = 12_000_000_000
-"""Beyond this an allocation fails, before the machine suffers."""
-
 _POLL_S = 0.05
-FAULTS = ("traceback", "crash", "hang", "memory", "promise")
-
-
-def serve(pipe: Connection, root: Path) -> None:
-    """Run the cases whose numbers arrive, in a process of its own; None ends it."""
-    import resource
-
-    from benchmarks.robustness.fuzz_cases import run_case, seeds
-
-    resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with (root / "stderr").open("ab") as log:
-        os.dup2(log.fileno(), 2)
-    for is_pan in (False, True):
-        seeds(is_pan, 80)
-    pipe.send(None)
-    while (number := pipe.recv()) is not None:
-        _reset_peak()
-        folder = root / f"case{number}"
-        folder.mkdir()
-        try:
-            row = run_case(number, folder)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-        pipe.send(row | {"rss_mb": _peak() / 1e6})
-
-
-def _reset_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-def _peak() -> int:
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+FAULTS = (
+    "traceback", "crash", "hang", "memory", "promise", "connection", "process", "foreign write",
+)  # fmt: skip
 
 
 def _rss(pid: int) -> int:
@@ -90,72 +72,137 @@ def _cpu_s(pid: int) -> float:
 
 @dataclass(slots=True)
 class Worker:
-    """A process, the case it runs, and since when."""
+    """A process in a sandbox, what it runs, and since when."""
 
     root: Path
-    process: BaseProcess
+    process: subprocess.Popen[bytes]
     pipe: Connection
+    server: LoopbackServer
+    trace: Trace | None
     number: int | None = None
+    plan: Plan | None = None
+    before: Snapshot = field(default_factory=dict)
+    connections: int = 0
     started: float = 0.0
     cpu_before: float = 0.0
 
     @classmethod
-    def start(cls, root: Path) -> Worker:
-        """Start a process and wait until it is warm."""
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
+    def start(cls, root: Path, traced: bool = True) -> Worker:
+        """Start a process and wait until it is warm.
+
+        Parameters
+        ----------
+        root : Path
+            Its sandbox becomes a folder of this one.
+        traced : bool
+            Under strace, so that what GDAL does is seen as well.
+        """
         folder = Path(tempfile.mkdtemp(dir=root))
-        process = context.Process(target=serve, args=(theirs, folder), daemon=True)
-        process.start()
+        trace = Trace(folder / "strace") if traced else None
+        ours, theirs = multiprocessing.Pipe()
+        module = [sys.executable, "-m", "benchmarks.robustness.worker", str(theirs.fileno())]
+        environment = _worst_environment(folder / "sandbox")
+        with (folder / "stderr").open("wb") as errors:
+            process = subprocess.Popen(
+                [*(trace.command() if trace else []), *module, str(folder / "sandbox" / "case")],
+                pass_fds=[theirs.fileno()], env=environment, cwd=ROOT, stderr=errors,
+                stdin=subprocess.DEVNULL,
+            )  # fmt: skip
         theirs.close()
-        ours.recv()
-        return cls(folder, process, ours)
+        try:
+            ours.recv()
+        except EOFError as error:
+            raise SystemExit((folder / "stderr").read_text()) from error
+        return cls(folder, process, ours, LoopbackServer(), trace)
+
+    @property
+    def sandbox(self) -> Path:
+        """The one folder in which the process may change anything."""
+        return self.root / "sandbox"
 
     def give(self, number: int) -> None:
         """Start a case."""
+        self.plan = None
+        if is_hostile(number):
+            self.plan = prepare(number, self.sandbox, self.server.address)
+        else:
+            shutil.rmtree(self.sandbox / "case", ignore_errors=True)
+            (self.sandbox / "case").mkdir()
+        self.before = snapshot(self.sandbox)
+        if self.trace:
+            self.trace.forget()
+        self.connections = self.server.count
         self.number, self.started = number, time.monotonic()
-        self.cpu_before = _cpu_s(self.process.pid or 0)
-        self.pipe.send(number)
+        self.cpu_before = _cpu_s(self.process.pid)
+        self.pipe.send(self.plan or number)
 
     def poll(self) -> Row | None:
         """Row of the case when it has ended, also when the process had to be ended or died."""
         try:
             if self.pipe.poll():
                 row: Row = self.pipe.recv()
-                return row | {"outcome": _judged(row)}
+                return self._judged(row)
         except (EOFError, ConnectionResetError):
-            self.process.join()
-            return self._lost("crash", f"exit code {self.process.exitcode}: {self._last_words()}")
+            self.process.wait()
+            code = self.process.returncode
+            return self._lost("crash", f"exit code {code}: {self._last_words()}")
         waited = time.monotonic() - self.started
-        if waited > WAIT_S or _cpu_s(self.process.pid or 0) - self.cpu_before > HANG_S:
+        wait_s = HOSTILE_WAIT_S if self.plan else WAIT_S
+        if waited > wait_s or _cpu_s(self.process.pid) - self.cpu_before > HANG_S:
             return self._lost("hang", f"stopped after {waited:.0f} s")
-        if (rss := _rss(self.process.pid or 0)) > 2 * LARGEST_RSS:
+        if (rss := _rss(self.process.pid)) > 2 * LARGEST_RSS:
             return self._lost("memory", f"{rss / 1e6:.0f} MB")
         return None
 
     def _lost(self, outcome: str, detail: str) -> Row:
-        self.stop()
+        self.process.kill()
+        self.process.wait()
+        name = self.plan.name if self.plan else ""
+        row = {"number": self.number, "name": name, "outcome": outcome, "detail": detail}
         seconds = time.monotonic() - self.started
-        row = {"number": self.number, "name": "", "outcome": outcome, "detail": detail}
-        return row | {"broken": [], "seconds": seconds, "rss_mb": 0.0}
+        return self._judged(row | {"broken": [], "seconds": seconds, "rss_mb": 0.0})
+
+    def _judged(self, row: Row) -> Row:
+        """With the worst that the case has done as its outcome."""
+        judgement = judge(
+            row, self.plan, self.before, self.sandbox,
+            self.trace.facts(self.sandbox / "case", self.sandbox) if self.trace else Facts(),
+        )  # fmt: skip
+        if (count := self.server.count - self.connections) > 0:
+            judgement["connection"].append(f"{count} connections to the server")
+        worst = next((kind for kind in reversed(FAULTS) if judgement.get(kind)), None)
+        outcome = row["outcome"]
+        if worst is None and row["rss_mb"] * 1e6 > LARGEST_RSS:
+            worst = "memory"
+        if worst is None or (worst == "promise" and outcome in FAULTS):
+            worst = outcome
+        broken = [fact for facts in judgement.values() for fact in facts]
+        return row | {"broken": broken, "outcome": worst}
 
     def _last_words(self) -> str:
         return (self.root / "stderr").read_bytes()[-500:].decode(errors="replace")
 
     def stop(self) -> None:
         """End the process."""
-        if self.process.is_alive() and self.process.pid:
-            os.kill(self.process.pid, signal.SIGKILL)
-        self.process.join()
+        self.process.kill()
+        self.process.wait()
+        self.pipe.close()
+        self.server.stop()
         shutil.rmtree(self.root, ignore_errors=True)
 
 
-def _judged(row: Row) -> str:
-    if row["outcome"] in ("ok", "error") and row["rss_mb"] * 1e6 > LARGEST_RSS:
-        return "memory"
-    if row["outcome"] in ("ok", "error") and row["broken"]:
-        return "promise"
-    return str(row["outcome"])
+def _worst_environment(sandbox: Path) -> dict[str, str]:
+    """Of a user who has switched on what he should not have."""
+    for name in ("home", "tmp", "case"):
+        (sandbox / name).mkdir(parents=True)
+    kept = {k: v for k, v in own_environment().items() if "proxy" not in k.lower()}
+    return {
+        **kept,
+        "GDAL_VRT_ENABLE_PYTHON": "YES",
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "HOME": str(sandbox / "home"),
+        "TMPDIR": str(sandbox / "tmp"),
+    }
 
 
 def run_cases(numbers: list[int], processes: int, minutes: float = math.inf) -> Iterator[Row]:
@@ -173,7 +220,8 @@ def run_cases(numbers: list[int], processes: int, minutes: float = math.inf) -> 
                     if row is None:
                         continue
                     yield row
-                    if not workers[index].process.is_alive():
+                    if workers[index].process.poll() is not None:
+                        workers[index].stop()
                         workers[index] = Worker.start(Path(name))
                     if time.monotonic() > stop or not _feed(workers[index], waiting):
                         busy.discard(index)
@@ -218,8 +266,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=20_000, help="cases, from number 0")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop starting cases then")
-    parser.add_argument("--case", type=int, help="run one case in this process and print it")
-    parser.add_argument("--keep", type=Path, help="new folder for the files of --case")
+    parser.add_argument("--case", type=int, help="run one case and print it")
+    parser.add_argument(
+        "--keep", type=Path, help="new folder for the sandbox of --case, as it is afterwards"
+    )
     parser.add_argument("--docs", type=Path, help="page whose table is replaced")
 
 
@@ -248,13 +298,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _one(number: int, keep: Path | None) -> int:
-    from benchmarks.robustness.fuzz_cases import run_case
-
-    folder = keep or Path(tempfile.mkdtemp())
-    folder.mkdir(parents=True, exist_ok=True)
-    row = run_case(number, folder)
+    with tempfile.TemporaryDirectory(prefix="fuzz") as name:
+        worker = Worker.start(Path(name))
+        try:
+            worker.give(number)
+            while (row := worker.poll()) is None:
+                time.sleep(_POLL_S)
+            if keep is not None:
+                shutil.move(worker.root, keep)
+        finally:
+            worker.stop()
     print(f"{row['name']}\n{row['outcome']}, {row['seconds']:.2f} s: {row['detail']}")
     print("\n".join(row["broken"]))
-    if keep is None:
-        shutil.rmtree(folder)
     return 0

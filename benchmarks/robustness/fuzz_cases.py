@@ -114,7 +114,7 @@ def prepare(number: int, folder: Path) -> Case:
 
 
 def run_case(number: int, folder: Path) -> Row:
-    """Run one case in an empty folder.
+    """Run one mutated case in an empty folder.
 
     Returns
     -------
@@ -123,26 +123,27 @@ def run_case(number: int, folder: Path) -> Row:
         promises not kept; ``seconds``.
     """
     case = prepare(number, folder)
-    started, detail = time.perf_counter(), ""
+    row, error = ended(lambda: DOING[case.action](case))
+    if error is not None:
+        check_message(error, case.broken)
+    return row | {"number": number, "name": ", ".join(case.parts), "broken": case.broken}
+
+
+def ended(doing: Callable[[], None]) -> tuple[Row, Exception | None]:
+    """Do something: its ``outcome``, ``detail`` and ``seconds``, and its clean error."""
+    started, detail, clean = time.perf_counter(), "", None
     try:
         with _quiet():
-            DOING[case.action](case)
+            doing()
         outcome = "ok"
     except (GeodelregError, click.ClickException) as error:
-        outcome, detail = "error", f"{type(error).__name__}: {error}"
-        _check_message(case, error)
+        outcome, detail, clean = "error", f"{type(error).__name__}: {error}", error
     except MemoryError:
         outcome, detail = "memory", traceback.format_exc(limit=-3)
     except Exception:
         outcome, detail = "traceback", traceback.format_exc(limit=-6)
-    return {
-        "number": number,
-        "name": ", ".join(case.parts),
-        "outcome": outcome,
-        "detail": detail[:3000].encode("utf-8", "replace").decode(),
-        "broken": case.broken,
-        "seconds": time.perf_counter() - started,
-    }
+    detail = detail[:3000].encode("utf-8", "replace").decode()
+    return {"outcome": outcome, "detail": detail, "seconds": time.perf_counter() - started}, clean
 
 
 @contextmanager
@@ -153,11 +154,12 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _check_message(case: Case, error: Exception) -> None:
+def check_message(error: Exception, broken: list[str]) -> None:
+    """What every error of geodelreg's has: a remedy, and a cause that a terminal can show."""
     if isinstance(error, GeodelregError) and not error.remedy:
-        case.broken.append("an error without a remedy")
+        broken.append("an error without a remedy")
     if isinstance(error, GeodelregError) and not error.cause.isprintable():
-        case.broken.append("an error message with control characters")
+        broken.append("an error message with control characters")
 
 
 def _state(folder: Path) -> dict[str, str]:

@@ -49,6 +49,8 @@ class Scenario:
 
 
 ALIGN = ("align", "ms.tif", "pan.tif", "-q", "-j", "1")
+BANDS = ("b1.tif", "b2.tif", "b3.tif")
+ALIGN_BANDS = ("align", *BANDS, *ALIGN[2:])
 SCENARIOS = (
     Scenario("align -o", (*ALIGN, "-o", "out.tif"), ("out.tif",)),
     Scenario(
@@ -64,6 +66,12 @@ SCENARIOS = (
         ("report.json", "points.geojson"),
     ),
     Scenario("revert", ("revert", "ms.tif", "-q"), ("ms.tif",), ((*ALIGN, "--in-place"),)),
+    Scenario("align B1 B2 B3 --in-place", (*ALIGN_BANDS, "--in-place"), BANDS),
+    Scenario(
+        "align B1 B2 B3 -o DIR",
+        (*ALIGN_BANDS, "-o", "out"),
+        tuple(f"out/{band}" for band in BANDS),
+    ),
 )
 
 
@@ -108,6 +116,11 @@ def _fresh(folder: Path) -> None:
         seeds = make_seeds(is_pan, PAN_SIDE)  # of which one is used
         seed = next(seed for seed in seeds if seed.name == "tiled-deflate")
         (folder / name).write_bytes(seed.files["ms.tif"])
+    with rasterio.open(folder / "ms.tif") as dataset:
+        profile = dataset.profile | {"count": 1}
+        for number, name in enumerate(BANDS, start=1):
+            with rasterio.open(folder / name, "w", **profile) as band:
+                band.write(dataset.read(number), 1)
 
 
 def run_scenario(scenario: Scenario, count: int, rng: random.Random, root: Path) -> Tally:
@@ -181,23 +194,29 @@ def _kind(folder: Path, name: str, before: dict[str, str], after: dict[str, str]
     if digest == after.get(name):
         return "new"
     if path.suffix == ".tif" and digest is not None:
-        return _header_kind(path, folder.parent)
+        return _header_kind(folder, name)
     return f"{name} is torn"
 
 
-def _header_kind(path: Path, root: Path) -> str:
+def _header_kind(folder: Path, name: str) -> str:
     """Of a raster with unused bytes at its end, as between two steps of an edit in place."""
-    with rasterio.open(path) as dataset:
+    with rasterio.open(folder / name) as dataset:
         found = (dataset.transform, dataset.checksum(1))
     for kind in ("old", "new"):
-        with rasterio.open(root / kind / path.name) as dataset:
+        path = folder.parent / kind / name
+        if not path.exists():
+            continue
+        with rasterio.open(path) as dataset:
             if found == (dataset.transform, dataset.checksum(1)):
                 return kind
-    return f"{path.name} is torn"
+    return f"{name} is torn"
 
 
 def _check_next_run(folder: Path, scenario: Scenario, after: dict[str, str], tally: Tally) -> None:
-    """The next run of the same command completes the work and leaves nothing else behind."""
+    """The next run of the same command completes the work and leaves nothing else behind.
+
+    Of several files it leaves all new, also when the killed run had replaced but some.
+    """
     args = [*scenario.args]
     if args[0] == "align" and "--in-place" not in args and "--overwrite" not in args:
         args.append("--overwrite")
@@ -208,6 +227,7 @@ def _check_next_run(folder: Path, scenario: Scenario, after: dict[str, str], tal
     done_before = result.returncode and "no record" in result.stderr
     if "--in-place" in args:  # a second edit of an edited file adds to the record
         good = result.returncode == 0 and set(found) == set(after)
+        good = good and all(_header_kind(folder, name) == "new" for name in scenario.outputs)
     else:
         good = (result.returncode == 0 or bool(done_before)) and found == after
     if not good:

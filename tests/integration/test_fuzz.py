@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import pytest
 import geodelreg
 from benchmarks.robustness.fuzz import Worker
 from benchmarks.robustness.fuzz_cases import GCPS, SHIFT, TAGS, WRITE_OPTIONS, run_case, seeds
+from benchmarks.robustness.hostile.families import is_hostile
 from geodelreg.errors import GeodelregError
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg.product.geotiff import write_corrected
@@ -32,6 +34,12 @@ CORPUS = sorted((Path(__file__).parents[1] / "data" / "fuzz").glob("*.*"))
 RASTERS = [path for path in CORPUS if path.suffix in (".tif", ".vrt", ".png")]
 POINTS = [path for path in CORPUS if path not in RASTERS]
 
+HOSTILE_COUNT = 6
+HOSTILE = list(filter(is_hostile, range(100_031, 101_000)))[:HOSTILE_COUNT]
+
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="watches processes through /proc"
+)
 # rasterio drops messages of GDAL that are no UTF-8 in this way
 pytestmark = pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning",
@@ -94,9 +102,11 @@ def test_points_that_once_broke_it(tmp_path: Path, broken: Path) -> None:
         cli.main(args, standalone_mode=False)
 
 
-@pytest.mark.parametrize("first", range(100_000, 100_200, 25))
+@pytest.mark.parametrize("first", range(100_000, 100_275, 25))
 def test_broken_inputs_end_cleanly(tmp_path: Path, first: int) -> None:
     for number in range(first, first + 25):
+        if is_hostile(number):
+            continue
         folder = tmp_path / str(number)
         folder.mkdir()
         row = run_case(number, folder)
@@ -104,12 +114,28 @@ def test_broken_inputs_end_cleanly(tmp_path: Path, first: int) -> None:
         assert row["broken"] == [], row
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="watches processes through /proc")
+@pytest.fixture(scope="module")
+def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Worker]:
+    one = Worker.start(tmp_path_factory.mktemp("worker"), shutil.which("strace") is not None)
+    yield one
+    one.stop()
+
+
+@needs_proc
+@pytest.mark.parametrize("number", HOSTILE)
+def test_hostile_inputs_change_fetch_and_run_nothing(worker: Worker, number: int) -> None:
+    worker.give(number)
+    while (row := worker.poll()) is None:
+        time.sleep(0.01)
+    assert row["outcome"] in ("ok", "error"), row
+    assert row["broken"] == [], row
+
+
+@needs_proc
 def test_a_dying_worker_is_noticed(tmp_path: Path) -> None:
-    worker = Worker.start(tmp_path)
+    worker = Worker.start(tmp_path, traced=False)
     try:
         worker.give(1)
-        assert worker.process.pid is not None
         os.kill(worker.process.pid, signal.SIGSEGV)
         while (row := worker.poll()) is None:
             time.sleep(0.01)
