@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
-from geodelreg.product.atomic import check_not_input, check_replaceable, unwritable
+from geodelreg.product.atomic import check_not_input, check_replaceable
+from geodelreg.product.durable import unwritable
 
 
 def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:

@@ -110,8 +110,9 @@ def write_warped(
             creation = user_creation(options) if driver == "GTiff" else {}
             draft = out
             if driver != "GTiff":
-                # the name may tell of flags
-                draft = out.parent.parent / "warped" / f"{source.stem}.tif"
+                room = max(0, 240 - len(os.fsencode(out.name)))  # the name may tell of flags
+                name = f"{out.name}.{source.stem[:room]}.tif"
+                draft = out.parent.parent / "scratch" / name
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
                 notes = _warp(source, draft, content, grid, creation, options)
