@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -36,23 +37,22 @@ def input_files(names: Iterable[str], allow: str = LOCAL) -> list[Path]:
         Also the sources inside VRTs, archives, and the side files that GDAL has found.
     """
     found: dict[Path, None] = {}
-    waiting = list(names)
+    waiting, seen = deque(names), set[str]()
+    given = set(waiting)
     while waiting:
-        name = waiting.pop()
-        path = _file_of(name)
-        if path in found:
+        name = waiting.popleft()
+        if name in seen:
             continue
+        seen.add(name)
+        path = _file_of(name)
         if path is not None:
             found[path] = None
-            for suffix in _WITH_A_VECTOR.get(path.suffix.lower(), ()):
-                found[path.with_suffix(suffix)] = None
-        with suppress(GeodelregError, OSError), open_dataset(name, allow=allow) as dataset:
-            with gdal_calls():
-                files = dataset.files
-            # of sources, a TIFF has no files but its side files, which are known by name
-            parts = [file for file in files if file != name]
-            waiting += [file for file in parts if not (is_local(file) and is_tiff(Path(file)))]
-            found |= dict.fromkeys(part for part in map(_file_of, parts) if part is not None)
+            others = _WITH_A_VECTOR.get(path.suffix.lower(), ())
+            found |= dict.fromkeys(path.with_suffix(suffix) for suffix in others)
+            if name not in given and is_tiff(path):
+                continue  # a source; what more belongs to it is known by name
+        with suppress(GeodelregError), open_dataset(name, allow=allow) as dataset, gdal_calls():
+            waiting += dataset.files
     return list(found)
 
 
