@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 
 from geodelreg.errors import (
@@ -25,6 +26,7 @@ from geodelreg.pipeline.register import correction_of, register
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
+from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.types import (
     Alignment,
@@ -219,7 +221,8 @@ def _examine(
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
     alignment = _alignment(rasters, pair, solution)
-    notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
+    unsure = [unsettled(Path(path)) for path in files]
+    notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
     timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
     alignment = replace(
         alignment,

@@ -53,9 +53,9 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     tags = provenance_tags(alignment)
     notes: list[str] = []
     with _targets(alignment, Path(target)) as pairs:
-        for path, out in pairs:
-            check_replaceable(out, options.overwrite, stale_beside(out, path))
         with together([out for _, out in pairs], lambda: _inputs(alignment)):
+            for path, out in pairs:
+                check_replaceable(out, options.overwrite, stale_beside(out, path))
             for path, out in pairs:
                 correction, gcps = _of_file(alignment, path)
                 if options.warp:
@@ -93,11 +93,17 @@ def write_in_place(alignment: Alignment) -> list[str]:
     return notes
 
 
-def revert(path: AnyPath) -> None:
-    """Take back what `write_in_place` did: the file is bit by bit what it was."""
-    from geodelreg.product.inplace import revert as revert_file
+def revert(*paths: AnyPath) -> None:
+    """Take back what `write_in_place` did: the files are bit by bit what they were.
 
-    revert_file(Path(path))
+    Raises
+    ------
+    UnsafeInPlaceError, OutputUnwritableError, FileLockedError, RasterNotFoundError
+        For one of the files; none is changed.
+    """
+    from geodelreg.product.inplace import revert as revert_files
+
+    revert_files(*map(Path, paths))
 
 
 def export_gcps(

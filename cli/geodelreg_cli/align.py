@@ -213,6 +213,8 @@ def _check_outputs(request: Request) -> list[Path]:
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
         rasters = [] if request.output is None else raster_targets(request.sources, request.output)
+        written = [*rasters, *(path for path in side_files if path != STDOUT)]
+        tidy([*written, *(map(Path, request.sources) if request.in_place else ())])
         check_targets(
             inputs,
             [*rasters, *side_files, *([STDOUT] if request.json else [])],
@@ -222,8 +224,6 @@ def _check_outputs(request: Request) -> list[Path]:
         )
     except UsageError as error:
         raise click.UsageError(str(error)) from error
-    written = [*rasters, *(path for path in side_files if path != STDOUT)]
-    tidy([*written, *(map(Path, request.sources) if request.in_place else ())])
     if not written:
         return []
     from geodelreg.writing import input_paths

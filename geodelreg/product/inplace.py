@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from html import escape
 from pathlib import Path
 from typing import BinaryIO
@@ -85,39 +85,50 @@ def edit_in_place(
     return notes
 
 
-def revert(path: Path) -> None:
-    """Take back all edits in place: the file is bit by bit what it was before the first.
+def revert(*paths: Path) -> None:
+    """Take back all edits in place: each file is bit by bit what it was before the first.
 
     Parameters
     ----------
-    path : Path
+    *paths : Path
+        Nothing is done unless it can be done to all of them.
 
     Raises
     ------
     UnsafeInPlaceError
-        There is no record of an edit, or another program has changed the file since.
+        There is no record of an edit, or another program has changed a file since.
     OutputUnwritableError, FileLockedError, RasterNotFoundError
     """
-    raster = Path(os.path.realpath(path))
-    check_editable(path)
-    with exclusive(raster) as folder, _opened(path, raster) as file:
-        edits = undo.load(raster)
-        if not edits:
-            raise UnsafeInPlaceError(
-                f"{path} has no record of an edit in place",
-                f"The record would be {undo.record_path(raster).name} in the same folder.",
-            )
-        following = [*edits[1:], None]
-        states = [one.state(raster, file, two) for one, two in zip(edits, following, strict=True)]
-        if State.FOREIGN in states:
-            raise UnsafeInPlaceError(
-                f"{path} was changed by another program after its header was edited",
-                "Taking the edit back would lose those changes; use a backup.",
-            )
-        while edits:
-            edits[-1].undo(raster, file, folder.scratch)
-            edits.pop()
-            undo.save(raster, edits, folder.scratch)
+    with ExitStack() as stack:
+        waiting = []
+        for path in dict.fromkeys(paths):
+            raster = Path(os.path.realpath(path))
+            check_editable(path)
+            folder = stack.enter_context(exclusive(raster))
+            file = stack.enter_context(_opened(path, raster))
+            waiting.append((raster, file, folder.scratch, _revertible(path, raster, file)))
+        for raster, file, scratch, edits in waiting:
+            while edits:
+                edits[-1].undo(raster, file, scratch)
+                edits.pop()
+                undo.save(raster, edits, scratch)
+
+
+def _revertible(path: Path, raster: Path, file: BinaryIO) -> list[Edit]:
+    edits = undo.load(raster)
+    if not edits:
+        raise UnsafeInPlaceError(
+            f"{path} has no record of an edit in place",
+            f"The record would be {undo.record_path(raster).name} in the same folder.",
+        )
+    following = [*edits[1:], None]
+    states = [one.state(raster, file, two) for one, two in zip(edits, following, strict=True)]
+    if State.FOREIGN in states:
+        raise UnsafeInPlaceError(
+            f"{path} was changed by another program after its header was edited",
+            "Taking the edit back would lose those changes; use a backup.",
+        )
+    return edits
 
 
 def check_editable(path: Path) -> None:

@@ -52,6 +52,17 @@ def private_path(target: Path) -> Path:
     return target.with_name(f".{name}.geodelreg")
 
 
+def unsettled(path: Path) -> str:
+    """Warning for a file that is to change together with others, which a killed run left undone."""
+    place = Path(os.path.realpath(path))
+    if not os.path.lexists(private_path(place) / "plan"):
+        return ""
+    return (
+        f"{path} is being written, or a run that wrote it was killed: it may not fit the files "
+        "that belong to it; the next align or revert that writes it settles that"
+    )
+
+
 class PrivateFolder:
     """The private folder of a target, locked.
 
@@ -152,7 +163,9 @@ class PrivateFolder:
         try:
             self._check_file(lock, lock.lstat())
         except FileNotFoundError:
-            self._check_content()  # before anything is put into it
+            left = [path.name for path in self.path.iterdir()]
+            if left and "lock" not in left:  # a run makes its lock first and removes it last
+                raise self.foreign(f"holds {left[0]} and no lock") from None
             return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_EXCL | _OPEN_SAFELY, 0o600)
         return os.open(lock, os.O_RDWR | _OPEN_SAFELY)
 
