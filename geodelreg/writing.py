@@ -52,17 +52,18 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     options = options or WriteOptions()
     tags = provenance_tags(alignment)
     notes: list[str] = []
-    with _targets(alignment, Path(target)) as pairs:
-        with together([out for _, out in pairs], lambda: _inputs(alignment)):
-            for path, out in pairs:
-                check_replaceable(out, options.overwrite, stale_beside(out, path))
-            for path, out in pairs:
-                correction, gcps = _of_file(alignment, path)
-                if options.warp:
-                    pan = alignment.reference
-                    notes += write_warped(path, out, correction, pan, tags, options)
-                else:
-                    notes += write_corrected(path, out, correction, gcps, tags, options)
+    with (
+        _targets(alignment, Path(target)) as pairs,
+        together([out for _, out in pairs], lambda: _inputs(alignment)),
+    ):
+        for path, out in pairs:
+            check_replaceable(out, options.overwrite, stale_beside(out, path))
+        for path, out in pairs:
+            correction, gcps = _of_file(alignment, path)
+            if options.warp:
+                notes += write_warped(path, out, correction, alignment.reference, tags, options)
+            else:
+                notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
 
 
