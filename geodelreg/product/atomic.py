@@ -13,7 +13,6 @@ import logging
 import os
 import shutil
 import sys
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -187,7 +186,7 @@ class Run:
         self._inputs = Inputs(inputs)
         self._locked: dict[Path, PrivateFolder] = {}
         self._plans: dict[PrivateFolder, journal.Plan] = {}
-        self._run = uuid.uuid4().hex
+        self._run = os.urandom(16).hex()
 
     def lock_all(self, targets: Iterable[Path]) -> None:
         """Lock targets, in an order that no two processes can block each other with."""
