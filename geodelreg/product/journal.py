@@ -150,8 +150,8 @@ class Plan:
 
     def _edit(self, folder: PrivateFolder) -> None:
         edits = undo.load(folder.target)
-        if len(edits) != self.edits:
-            return  # reverted, or its record was removed
+        if len(edits) != self.edits or not folder.target.is_file():
+            return  # reverted or removed
         with folder.target.open("r+b", buffering=0) as file:
             if edits[-1].state(folder.target, file) is undo.State.FOREIGN:
                 raise UnsafeInPlaceError(
@@ -164,7 +164,7 @@ class Plan:
         if os.path.lexists(folder.files / undo.record_path(folder.target).name):
             return
         edits = undo.load(folder.target)
-        if len(edits) != self.edits:
+        if len(edits) != self.edits or not folder.target.is_file():
             return
         with folder.target.open("r+b", buffering=0) as file:
             if edits[-1].state(folder.target, file) is not undo.State.FOREIGN:

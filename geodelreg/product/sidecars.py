@@ -70,12 +70,15 @@ def possible_sidecars(raster: Path) -> list[Path]:
 def belongs(target: Path, name: str) -> bool:
     """Whether a file of that name, beside `target`, is it or can be a part of it.
 
-    Formats of several files name them after the stem (``x.bil``, ``x.hdr``) or the whole name.
+    Formats of several files name them after the stem (``x.bil``, ``x.hdr``) or the whole name;
+    databases have journals (``x.gpkg-journal``).
     """
     extension = name.removeprefix(target.stem + ".")
     of_stem = name != extension and "." not in extension and len(extension) <= _LONGEST_EXTENSION
     is_plain = name not in ("", ".", "..") and "/" not in name and os.sep not in name
-    return is_plain and (name == target.name or name.startswith(target.name + ".") or of_stem)
+    return is_plain and (
+        name == target.name or name.startswith((target.name + ".", target.name + "-")) or of_stem
+    )
 
 
 def all_sidecars(raster: Path) -> list[Path]:

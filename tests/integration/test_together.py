@@ -407,6 +407,21 @@ def test_kill_of_a_second_edit_takes_back_that_one_only(folder: Path) -> None:
     assert seen == {TRANSFORM @ SHIFT, TRANSFORM @ SHIFT @ SHIFT}
 
 
+def test_a_raster_that_was_removed_after_the_kill_blocks_nobody(folder: Path) -> None:
+    paths = bands(folder)
+    result, before = found_for(paths), contents(folder)
+    step = 1
+    while run_killed(lambda: geodelreg.write_in_place(result), step, partly=True):
+        paths[1].unlink()
+        tidy(paths)
+        assert transform_of(paths[0]) == transform_of(paths[2])
+        write_text_atomically(paths[1], "new", overwrite=False)
+        assert not [name for name in names(folder) if name.startswith(".")]
+        restore(folder, before)
+        step += 5
+    assert step > 40
+
+
 def test_file_named_twice_is_edited_by_neither_name(folder: Path) -> None:
     path = make_tiff(folder / "B1.tif", shape=(40, 50))
     (folder / "link.tif").symlink_to(path)
