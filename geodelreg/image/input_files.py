@@ -11,6 +11,7 @@ from pathlib import Path
 from geodelreg.errors import GeodelregError
 from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import gdal_calls
+from geodelreg.image.mask_vector import is_vector
 from geodelreg.image.opening import open_dataset
 from geodelreg.image.paths import is_local
 from geodelreg.tiff import is_tiff
@@ -18,6 +19,8 @@ from geodelreg.tiff import is_tiff
 _WITH_A_VECTOR = {
     ".shp": (".shx", ".dbf", ".prj", ".cpg", ".qpj", ".sbn", ".sbx", ".qix"),
     ".gml": (".xsd", ".gfs"),
+    ".tab": (".dat", ".map", ".id", ".ind"),
+    ".mif": (".mid",),
 }
 
 
@@ -49,10 +52,14 @@ def input_files(names: Iterable[str], allow: str = LOCAL) -> list[Path]:
             found[path] = None
             others = _WITH_A_VECTOR.get(path.suffix.lower(), ())
             found |= dict.fromkeys(path.with_suffix(suffix) for suffix in others)
-            if name not in given and is_tiff(path):
-                continue  # a source; what more belongs to it is known by name
+        if is_vector(name) or (path is not None and name not in given and is_tiff(path)):
+            continue  # what more belongs to a TIFF, here the source of a VRT, is known by name
+        parts: list[str] = []
         with suppress(GeodelregError), open_dataset(name, allow=allow) as dataset, gdal_calls():
-            waiting += dataset.files
+            parts = [part for part in dataset.files if part != name]
+            if dataset.driver == "VRT":  # side files are not opened as rasters
+                waiting += [part for part in parts if not part.startswith(name)]
+        found |= dict.fromkeys(path for path in map(_file_of, parts) if path is not None)
     return list(found)
 
 
