@@ -316,5 +316,8 @@ def name_lost(place: Path, lost: Sequence[str]) -> None:
 
 def _print(data: bytes) -> None:
     sys.stdout.flush()
-    sys.stdout.buffer.write(data)
-    sys.stdout.buffer.flush()
+    if hasattr(sys.stdout, "buffer"):
+        sys.stdout.buffer.write(data)
+    else:  # a notebook's, which takes text only
+        sys.stdout.write(data.decode(errors="replace"))
+    sys.stdout.flush()

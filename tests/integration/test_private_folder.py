@@ -114,6 +114,7 @@ PLANTED: dict[str, Plant] = {
     "plan of nothing": plan_that_is("{}"),
     "plan of nested lists": plan_that_is("[" * 100_000),
     "plan is not text": entry("plan", lambda path: path.write_bytes(b"\xff\xfe\x00")),
+    "ready is no JSON": entry("ready", lambda path: path.write_text("{")),
     "foreign name": entry("files/thesis.doc", lambda path: path.write_text("mine")),
     "foreign folder": entry("photos/1.jpg", lambda path: path.write_text("mine")),
     "folder of files": entry("files/ms.tif.d", Path.mkdir),
