@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from geodelreg import errors
-    from geodelreg.api import align, check, export_gcps, revert, write, write_in_place
+    from geodelreg.api import align, check
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.check import Check
     from geodelreg.types import Alignment
+    from geodelreg.writing import export_gcps, revert, write, write_in_place
 
 __version__ = "0.1.0"
 
@@ -39,10 +40,10 @@ _HOMES = {
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
     "check": "geodelreg.api",
-    "export_gcps": "geodelreg.api",
-    "revert": "geodelreg.api",
-    "write": "geodelreg.api",
-    "write_in_place": "geodelreg.api",
+    "export_gcps": "geodelreg.writing",
+    "revert": "geodelreg.writing",
+    "write": "geodelreg.writing",
+    "write_in_place": "geodelreg.writing",
 }
 
 

@@ -1,11 +1,10 @@
-"""What users call: open the rasters, run the method, write the products."""
+"""What users call: open the rasters, run the method; `geodelreg.writing` has the rest."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from time import perf_counter
 
@@ -13,12 +12,11 @@ from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
     NoOverlapError,
-    OutputUnwritableError,
     UsageError,
 )
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
-from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg.options import AlignOptions
 from geodelreg.pipeline.check import (
     is_affine_enough,
     judge_misalignment,
@@ -28,17 +26,15 @@ from geodelreg.pipeline.register import correction_of, register
 from geodelreg.pipeline.solve import Solution
 from geodelreg.pipeline.state import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
-from geodelreg.product.provenance import fingerprint, provenance_tags, versions
+from geodelreg.product.private import unsettled
+from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.types import (
     Alignment,
     CheckOutcome,
-    Correction,
-    Gcp,
     Misalignment,
-    Outcome,
 )
+from geodelreg.writing import AnyPath
 
-AnyPath = str | PathLike[str]
 MAX_LIMIT_PX = 1e6
 
 
@@ -225,7 +221,8 @@ def _examine(
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
     alignment = _alignment(rasters, pair, solution)
-    notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
+    unsure = [unsettled(Path(path)) for path in files]
+    notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
     timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
     alignment = replace(
         alignment,
@@ -262,138 +259,3 @@ def _paths(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
     if isinstance(source, str) or hasattr(source, "__fspath__"):
         return (str(source),)
     return tuple(str(path) for path in source)
-
-
-def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = None) -> list[str]:
-    """Write the MS raster with its corrected georeferencing and the same pixels.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        As returned by `align`; one that is already aligned gives a copy with provenance.
-    target : path
-        The output; with several MS files the folder for them, made when missing.
-    options : WriteOptions, optional
-        Its `warp` resamples north-up instead of correcting the header.
-
-    Returns
-    -------
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    OutputExistsError, OutputIsInputError, OutputUnwritableError, LossyOutputError, ...
-        Nothing is then changed on disk.
-    """
-    from geodelreg.product.geotiff import write_corrected
-    from geodelreg.product.warp import write_warped
-
-    options = options or WriteOptions()
-    tags = provenance_tags(alignment)
-    notes: list[str] = []
-    for path, out in _targets(alignment, Path(target)):
-        correction, gcps = _of_file(alignment, path)
-        if options.warp:
-            notes += write_warped(path, out, correction, alignment.reference, tags, options)
-        else:
-            notes += write_corrected(path, out, correction, gcps, tags, options)
-    return notes
-
-
-def write_in_place(alignment: Alignment) -> list[str]:
-    """Correct the headers of the MS files themselves; `revert` takes it back.
-
-    Returns
-    -------
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    UnsafeInPlaceError, FileLockedError, OutputUnwritableError
-        The file is then as it was.
-    """
-    from geodelreg.product.atomic import tidy
-    from geodelreg.product.inplace import edit_in_place
-
-    if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
-        tidy(map(Path, alignment.source_paths))
-        return []
-    tags = provenance_tags(alignment)
-    notes: list[str] = []
-    for name in alignment.source_paths:
-        notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
-    return notes
-
-
-def revert(path: AnyPath) -> None:
-    """Take back what `write_in_place` did: the file is bit by bit what it was."""
-    from geodelreg.product.inplace import revert as revert_file
-
-    revert_file(Path(path))
-
-
-def export_gcps(
-    alignment: Alignment,
-    path: AnyPath,
-    format: str | None = None,  # noqa: A002 - the field's word
-    overwrite: bool = False,
-) -> None:
-    """Write the kept tie points as ground control points of the MS raster.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    path : path
-    format : str, optional
-        One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
-    overwrite : bool
-
-    Raises
-    ------
-    GcpFormatError
-        If the format is not known.
-    OutputExistsError, OutputUnwritableError
-    """
-    from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
-
-    context = gcp_context(alignment)
-    write_gcps(
-        Path(path), gcps_from_alignment(alignment), format, context=context, overwrite=overwrite
-    )
-
-
-def _targets(alignment: Alignment, target: Path) -> list[tuple[Path, Path]]:
-    """MS files with their outputs."""
-    sources = [Path(path) for path in alignment.source_paths]
-    if len(sources) == 1:
-        return [(sources[0], target)]
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputUnwritableError(
-            f"{target} cannot be made a folder ({error.strerror})",
-            "With several MS files the output is a folder; name another one.",
-        ) from error
-    return [(path, target / path.name) for path in sources]
-
-
-def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
-    """Correction and GCPs of one MS file; files on other grids share the ground, not the pixels."""
-    from geodelreg.product.gcps import gcps_from_alignment
-
-    gcps, shared = gcps_from_alignment(alignment), alignment.correction
-    if len(alignment.source_paths) == 1:
-        return shared, gcps
-    with open_raster(path, allow=alignment.options.allow) as reader:
-        own = reader.grid.transform
-    if own == shared.original:
-        return shared, gcps
-    corrected = shared.apply(own)
-    to_own = ~own @ shared.original
-    moved = tuple(
-        replace(gcp, column=column, row=row)
-        for gcp, (column, row) in ((gcp, to_own @ (gcp.column, gcp.row)) for gcp in gcps)
-    )
-    return replace(shared, original=own, corrected=corrected), moved

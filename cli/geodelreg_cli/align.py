@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,13 +94,15 @@ def align_params() -> list[SectionOption]:
             type=FILE,
             metavar="OUT",
             section=OUTPUT,
-            help="Corrected MS raster; with several MS files, the folder for them.",
+            help="Corrected MS raster; with several MS files, the folder for them: all or none of "
+            "them appear.",
         ),
         flag(
             "--in-place",
             is_flag=True,
             section=OUTPUT,
-            help="Correct the header of MS itself, whatever its size; keeps a record to undo it.",
+            help="Correct the header of MS itself, whatever its size (of all MS files or none); "
+            "keeps a record to undo it.",
         ),
         flag(
             "--dry-run",
@@ -116,7 +119,7 @@ def align_params() -> list[SectionOption]:
             section=OUTPUT,
             help="Write the tie points as ground control points; the format follows the extension: "
             ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .vrt, "
-            ".pts ENVI. May be repeated.",
+            ".pts ENVI; - writes to stdout. May be repeated.",
         ),
         flag(
             "--gcp-format",
@@ -129,14 +132,15 @@ def align_params() -> list[SectionOption]:
             type=FILE,
             metavar="FILE.json",
             section=OUTPUT,
-            help="Write everything that was found out as JSON; also after a refusal.",
+            help="Write everything that was found out as JSON; also after a refusal. - writes to "
+            "stdout.",
         ),
         flag(
             "--figure",
             type=FILE,
             metavar="FILE.png",
             section=OUTPUT,
-            help="Draw the tie points on both images (needs the report extra).",
+            help="Draw the tie points on both images (needs the report extra); - writes to stdout.",
         ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
         *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
@@ -158,8 +162,7 @@ def align(rasters: tuple[str, ...], **given: Any) -> None:
     """
     start_run(given)
     request = _request(rasters, given)
-    _check_outputs(request)
-    _run(request)
+    _run(request, _check_outputs(request))
 
 
 def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
@@ -192,20 +195,44 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     )
 
 
-def _check_outputs(request: Request) -> None:
+def _check_outputs(request: Request) -> list[Path]:
+    """Refuse what cannot be written, after settling what a killed run has left beside it.
+
+    Returns
+    -------
+    list of Path
+        Everything that is read, down to the sources of VRTs and side files.
+    """
+    from geodelreg.product.atomic import tidy
+    from geodelreg.product.targets import STDOUT, Inputs
     from geodelreg_cli.outputs import check_targets, raster_targets
 
-    rasters = [] if request.output is None else raster_targets(request.sources, request.output)
-    side_files = [*request.gcps, request.report, request.figure]
-    targets = [*rasters, *(path for path in side_files if path is not None)]
     _check_gcp_formats(request)
-    created = request.output if len(request.sources) > 1 else None
+    side_files = [path for path in (*request.gcps, request.report, request.figure) if path]
     masks = (*request.options.masks, *request.options.pan_masks)
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
-        check_targets(inputs, targets, request.write_options.overwrite, created)
+        rasters = [] if request.output is None else raster_targets(request.sources, request.output)
+        written = [*rasters, *(path for path in side_files if path != STDOUT)]
+        tidy([*written, *(map(Path, request.sources) if request.in_place else ())])
+        check_targets(
+            inputs,
+            [*rasters, *side_files, *([STDOUT] if request.json else [])],
+            request.write_options.overwrite,
+            request.output if len(request.sources) > 1 else None,
+            rasters,
+        )
     except UsageError as error:
         raise click.UsageError(str(error)) from error
+    if not written:
+        return []
+    from geodelreg.writing import input_paths
+
+    read = input_paths(inputs, request.options.allow)
+    known = Inputs(read)
+    for path in written:
+        known.check(path)
+    return read
 
 
 def _check_gcp_formats(request: Request) -> None:
@@ -222,9 +249,10 @@ def _check_gcp_formats(request: Request) -> None:
             )
 
 
-def _run(request: Request) -> None:
-    """Align, then write what was asked for; a refusal leaves the report only."""
+def _run(request: Request, inputs: Sequence[Path]) -> None:
+    """Align, then write what was asked for, all or nothing; a refusal leaves the report only."""
     import geodelreg
+    from geodelreg.product.atomic import together
     from geodelreg.product.report import report_json, summary_text
 
     source = request.sources[0] if len(request.sources) == 1 else request.sources
@@ -235,13 +263,15 @@ def _run(request: Request) -> None:
             )
     except AlignmentRefusedError as refusal:
         if refusal.alignment is not None:
-            _publish_report(report_json(refusal.alignment), request)
+            with together(inputs=lambda: inputs):
+                _write_report(report_json(refusal.alignment), request)
             if not request.quiet:
                 click.echo(_step_counts(refusal.alignment), err=True)
         raise
     report = report_json(alignment)  # of the inputs as they are: --in-place changes one
-    _write(alignment, request)
-    _publish_report(report, request)
+    with together(inputs=lambda: inputs):
+        _write(alignment, request)
+        _write_report(report, request)
     if not request.quiet:
         click.echo(summary_text(alignment), err=True)
         click.echo(_step_counts(alignment), err=True)
@@ -254,7 +284,7 @@ def _step_counts(alignment: Alignment) -> str:
 
 
 def _write(alignment: Alignment, request: Request) -> None:
-    """Write the raster first: what it can refuse must leave no side files behind."""
+    """Write the raster, then the control points and the figure."""
     import geodelreg
     from geodelreg_cli.figure import bands_to_show
 
@@ -275,10 +305,10 @@ def _write(alignment: Alignment, request: Request) -> None:
         draw_matches(*shown, alignment, request.figure, overwrite=overwrite)
 
 
-def _publish_report(text: str, request: Request) -> None:
-    if request.report is not None:
-        from geodelreg.product.atomic import write_text_atomically
+def _write_report(text: str, request: Request) -> None:
+    from geodelreg.product.atomic import write_text_atomically
+    from geodelreg.product.targets import STDOUT
 
-        write_text_atomically(request.report, text + "\n", request.write_options.overwrite)
-    if request.json:
-        click.echo(text)
+    for path in (request.report, STDOUT if request.json else None):
+        if path is not None:
+            write_text_atomically(path, text + "\n", request.write_options.overwrite)

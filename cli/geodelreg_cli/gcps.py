@@ -68,7 +68,7 @@ def gcps(
     debug: bool,
     allow: str,
 ) -> None:
-    """Convert the ground control points of file IN to file OUT.
+    """Convert the ground control points of file IN to file OUT; - is stdout and needs --to.
 
     Pixel conventions are converted exactly (QGIS and ENVI count differently from GDAL), and map
     coordinates in another system than that of MS are transformed into it.
@@ -76,7 +76,9 @@ def gcps(
     configure_logging(verbose, quiet, debug)
     keep_to(allow)
     from geodelreg.image.reader import open_raster
+    from geodelreg.product.atomic import together
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
+    from geodelreg.writing import input_paths
 
     def grid(path: str) -> Grid:
         with open_raster(path, allow=allow) as reader:
@@ -91,7 +93,9 @@ def gcps(
     points, crs_wkt = read_gcps(source, from_format, context)
     if crs_wkt is not None:
         points = _in_crs(points, crs_wkt, context.source.crs_wkt)
-    write_gcps(target, points, to_format, context=context, overwrite=overwrite)
+    rasters = [raster] if reference is None else [raster, reference]
+    with together(inputs=lambda: [source, *input_paths(rasters, allow)]):
+        write_gcps(target, points, to_format, context=context, overwrite=overwrite)
     if not quiet:
         click.echo(f"{target}: {len(points)} points", err=True)
 

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
-from geodelreg.product.atomic import check_not_input, check_replaceable, unwritable
+from geodelreg.product.durable import unwritable
+from geodelreg.product.sidecars import possible_sidecars
+from geodelreg.product.targets import STDOUT, Inputs, check_replaceable
 
 
 def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
@@ -27,6 +29,8 @@ def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
     OutputUnwritableError
         OUT is a folder and should be a file, or the reverse.
     """
+    if output == STDOUT:
+        raise UsageError("-o -: a raster cannot be written to standard output", "Name a file.")
     if len(sources) == 1:
         if output.is_dir():
             raise OutputUnwritableError(
@@ -48,7 +52,11 @@ def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
 
 
 def check_targets(
-    inputs: Sequence[str], targets: Sequence[Path], overwrite: bool, created: Path | None = None
+    inputs: Sequence[str],
+    targets: Sequence[Path],
+    overwrite: bool,
+    created: Path | None = None,
+    rasters: Sequence[Path] = (),
 ) -> None:
     """Refuse outputs that cannot be written as asked, before anything is read.
 
@@ -57,11 +65,13 @@ def check_targets(
     inputs : sequence of str
         Files that are read and must stay as they are.
     targets : sequence of Path
-        All files that will be written.
+        All files that will be written; ``-`` is standard output.
     overwrite : bool
         Existing targets may be replaced.
     created : Path, optional
         Folder that will be created when it is missing.
+    rasters : sequence of Path
+        Those of `targets` that are rasters: others must not be taken for side files of them.
 
     Raises
     ------
@@ -69,13 +79,21 @@ def check_targets(
         Two outputs are the same file.
     OutputIsInputError, OutputExistsError, OutputUnwritableError
     """
+    known = Inputs(map(Path, inputs))
+    parts = {os.path.realpath(side): out for out in rasters for side in possible_sidecars(out)}
     seen: set[str] = set()
     for target in targets:
-        resolved = os.path.realpath(target)
+        resolved = "-" if target == STDOUT else os.path.realpath(target)
         if resolved in seen:
             raise UsageError(f"{target} is named for two outputs", "Give each its own name.")
         seen.add(resolved)
-        check_not_input(target, map(Path, inputs))
+        if target == STDOUT:
+            continue
+        if resolved in parts:
+            raise UsageError(
+                f"{target} would be taken for a part of {parts[resolved]}", "Choose another name."
+            )
+        known.check(target)
         check_replaceable(target, overwrite)
         folder = target.absolute().parent
         if created is not None and folder == created.absolute() and not folder.exists():

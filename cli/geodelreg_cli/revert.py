@@ -20,12 +20,13 @@ from geodelreg_cli.options import SectionCommand
 def revert(files: tuple[Path, ...], quiet: bool, verbose: int, debug: bool) -> None:
     """Undo "align --in-place": put the original header back.
 
-    The record of it is kept with each file; the pixels were never touched.
+    The record of it is kept with each file; the pixels were never touched. Of several files all are
+    put back or, when one cannot be, none.
     """
     configure_logging(verbose, quiet, debug)
     import geodelreg
 
-    for file in files:
-        geodelreg.revert(file)
-        if not quiet:
+    geodelreg.revert(*files)
+    if not quiet:
+        for file in files:
             click.echo(f"{file}: original georeferencing is back", err=True)

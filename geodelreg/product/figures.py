@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
-from geodelreg.product.atomic import staged
+from geodelreg.product.atomic import write_bytes_atomically
+from geodelreg.product.targets import STDOUT
 from geodelreg.types import Alignment, Band, FloatArray, Grid, IntArray
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ _STYLE: Any = {
 
 @contextmanager
 def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
-    """Figure that is written to `path`, whole or not at all, when the block ends."""
+    """Figure that is written to `path`, whole or not at all, when the block ends; PNG to ``-``."""
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
@@ -52,7 +54,7 @@ def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterat
         raise MissingExtraError(
             "figures need matplotlib", "Install it: pip install 'geodelreg[report]'."
         ) from error
-    suffix = path.suffix.lower()
+    suffix = ".png" if path == STDOUT else path.suffix.lower()
     if suffix not in _FORMATS:
         raise UsageError(
             f"{path.name}: figures are not written as {suffix or 'files without extension'}",
@@ -64,8 +66,9 @@ def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterat
         dates = {"Software": None} if suffix == ".png" else {"Date": None}
         if suffix == ".pdf":
             dates = {"CreationDate": None}
-        with staged(path, overwrite=overwrite) as work:
-            figure.savefig(work, dpi=150, metadata=dates, format=suffix[1:])
+        drawn = BytesIO()
+        figure.savefig(drawn, dpi=150, metadata=dates, format=suffix[1:])
+        write_bytes_atomically(path, drawn.getvalue(), overwrite)
 
 
 def draw_matches(

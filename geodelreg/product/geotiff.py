@@ -14,11 +14,12 @@ from geodelreg.errors import RasterUnreadableError, UsageError
 from geodelreg.fatal import check_survivable
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
-from geodelreg.product.atomic import check_not_input, staged
+from geodelreg.product.atomic import staged
 from geodelreg.product.copying import open_source
 from geodelreg.product.environment import gdal_failures, gdal_session
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import output_driver, rewrite
+from geodelreg.product.targets import check_not_input
 from geodelreg.product.tiffwrite import copy_with_header, is_cog
 from geodelreg.tiff import is_tiff
 from geodelreg.types import Correction, Gcp

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from html import escape
 from pathlib import Path
 from typing import BinaryIO
@@ -21,7 +21,8 @@ from geodelreg.errors import (
     UnsafeInPlaceError,
 )
 from geodelreg.product import compare, metadata, relayout, sidecars, undo
-from geodelreg.product.atomic import exclusive, unwritable
+from geodelreg.product.atomic import exclusive, together
+from geodelreg.product.durable import unwritable
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Georeference, Provenance, corrected_entries
@@ -69,8 +70,9 @@ def edit_in_place(
     """
     content = Provenance(correction, gcps, tags)
     raster = Path(os.path.realpath(path))
-    with gdal_session(path), _opened(path, raster) as file:
-        edits = _recovered(raster, file)
+    check_editable(path)
+    with together([raster]) as run, gdal_session(path), _opened(path, raster) as file:
+        edits = _recovered(raster, file, run.lock(raster).scratch)
         check_source(raster)
         notes = []
         if edits and edits[-1].state(raster, file) is State.FOREIGN:
@@ -79,77 +81,91 @@ def edit_in_place(
         edit = _planned(path, raster, file, content)
         if _has_rpc(raster):
             notes.append(f"{path}: its RPCs do not know the correction; write to OUT to drop them")
-        try:
-            undo.save(raster, [*edits, edit])
-            edit.apply(raster, file)
-        except BaseException:
-            edit.undo(raster, file)
-            undo.save(raster, edits)
-            raise
+        run.add_edit(raster, [*edits, edit])
     return notes
 
 
-def revert(path: Path) -> None:
-    """Take back all edits in place: the file is bit by bit what it was before the first.
+def revert(*paths: Path) -> None:
+    """Take back all edits in place: each file is bit by bit what it was before the first.
 
     Parameters
     ----------
-    path : Path
+    *paths : Path
+        Nothing is done unless it can be done to all of them.
 
     Raises
     ------
     UnsafeInPlaceError
-        There is no record of an edit, or another program has changed the file since.
+        There is no record of an edit, or another program has changed a file since.
     OutputUnwritableError, FileLockedError, RasterNotFoundError
     """
-    raster = Path(os.path.realpath(path))
-    with _opened(path, raster) as file:
-        edits = undo.load(raster)
-        if not edits:
-            raise UnsafeInPlaceError(
-                f"{path} has no record of an edit in place",
-                f"The record would be {undo.record_path(raster).name} in the same folder.",
-            )
-        following = [*edits[1:], None]
-        states = [one.state(raster, file, two) for one, two in zip(edits, following, strict=True)]
-        if State.FOREIGN in states:
-            raise UnsafeInPlaceError(
-                f"{path} was changed by another program after its header was edited",
-                "Taking the edit back would lose those changes; use a backup.",
-            )
-        while edits:
-            edits[-1].undo(raster, file)
-            edits.pop()
-            undo.save(raster, edits)
+    with ExitStack() as stack:
+        waiting = []
+        for path in dict.fromkeys(paths):
+            raster = Path(os.path.realpath(path))
+            check_editable(path)
+            folder = stack.enter_context(exclusive(raster))
+            file = stack.enter_context(_opened(path, raster))
+            waiting.append((raster, file, folder.scratch, _revertible(path, raster, file)))
+        for raster, file, scratch, edits in waiting:
+            while edits:
+                edits[-1].undo(raster, file, scratch)
+                edits.pop()
+                undo.save(raster, edits, scratch)
+
+
+def _revertible(path: Path, raster: Path, file: BinaryIO) -> list[Edit]:
+    edits = undo.load(raster)
+    if not edits:
+        raise UnsafeInPlaceError(
+            f"{path} has no record of an edit in place",
+            f"The record would be {undo.record_path(raster).name} in the same folder.",
+        )
+    following = [*edits[1:], None]
+    states = [one.state(raster, file, two) for one, two in zip(edits, following, strict=True)]
+    if State.FOREIGN in states:
+        raise UnsafeInPlaceError(
+            f"{path} was changed by another program after its header was edited",
+            "Taking the edit back would lose those changes; use a backup.",
+        )
+    return edits
+
+
+def check_editable(path: Path) -> None:
+    """Refuse a file that is no TIFF or cannot be written.
+
+    Raises
+    ------
+    UnsafeInPlaceError, OutputUnwritableError, RasterNotFoundError
+    """
+    if not path.is_file():
+        raise RasterNotFoundError(f"{path} does not exist", "Check the name.")
+    if not is_tiff(path):
+        raise UnsafeInPlaceError(f"{path} is no TIFF, its header cannot be edited", _TO_OUT)
+    if not os.access(path, os.W_OK):
+        raise OutputUnwritableError(
+            f"{path} cannot be written: the file is read-only", "Change its permissions."
+        )
 
 
 @contextmanager
 def _opened(path: Path, raster: Path) -> Iterator[BinaryIO]:
-    """Open a raster for an edit, under its lock."""
-    if not raster.is_file():
-        raise RasterNotFoundError(f"{path} does not exist", "Check the name.")
-    if not is_tiff(raster):
-        raise UnsafeInPlaceError(f"{path} is no TIFF, its header cannot be edited", _TO_OUT)
-    if not os.access(raster, os.W_OK):
-        raise OutputUnwritableError(
-            f"{path} cannot be written: the file is read-only", "Change its permissions."
-        )
-    with exclusive(raster):
-        try:
-            with raster.open("r+b", buffering=0) as file:
-                yield file
-        except OSError as error:
-            raise unwritable(path, error) from error
+    """Open a raster whose lock is held, for an edit."""
+    try:
+        with raster.open("r+b", buffering=0) as file:
+            yield file
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
-def _recovered(raster: Path, file: BinaryIO) -> list[Edit]:
-    """Edits on record, after taking back one that was interrupted."""
+def _recovered(raster: Path, file: BinaryIO, scratch: Path) -> list[Edit]:
+    """Edits on record, after taking back one that shows only in part: a backup was put back."""
     edits = undo.load(raster)
     if edits and edits[-1].state(raster, file) in (State.NONE, State.STARTED):
         logger.warning("%s: taking back an edit that was interrupted", raster)
-        edits[-1].undo(raster, file)
+        edits[-1].undo(raster, file, scratch)
         edits.pop()
-        undo.save(raster, edits)
+        undo.save(raster, edits, scratch)
     return edits
 
 

@@ -28,6 +28,7 @@ UNDO_SUFFIX = ".geodelreg-undo.json"
 _PLACEMENT_ELEMENTS = ("SRS", "GeoTransform", "GCPList")
 _ESRI_DOMAIN = "xml:ESRI"
 _MAX_PAM_BYTES = 64_000_000
+_LONGEST_EXTENSION = 5
 
 
 def beside(raster: Path, suffix: str) -> Path:
@@ -58,6 +59,26 @@ def world_files(raster: Path) -> list[Path]:
         if path.is_file() and not any(path.samefile(other) for other in found):
             found.append(path)
     return found
+
+
+def possible_sidecars(raster: Path) -> list[Path]:
+    """All names, existing or not, of files that GDAL, or `revert`, takes for a part of `raster`."""
+    suffixed = [beside(raster, suffix) for suffix in (*PIXEL_SUFFIXES, UNDO_SUFFIX)]
+    return [*suffixed, *placement_sidecars(raster)]
+
+
+def belongs(target: Path, name: str) -> bool:
+    """Whether a file of that name, beside `target`, is it or can be a part of it.
+
+    Formats of several files name them after the stem (``x.bil``, ``x.hdr``) or the whole name;
+    databases have journals (``x.gpkg-journal``).
+    """
+    extension = name.removeprefix(target.stem + ".")
+    of_stem = name != extension and "." not in extension and len(extension) <= _LONGEST_EXTENSION
+    is_plain = name not in ("", ".", "..") and "/" not in name and os.sep not in name
+    return is_plain and (
+        name == target.name or name.startswith((target.name + ".", target.name + "-")) or of_stem
+    )
 
 
 def all_sidecars(raster: Path) -> list[Path]:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from geodelreg.product import relayout
-from geodelreg.product.atomic import write_fully
 from geodelreg.product.copying import Unchanged, copy_range, open_source
+from geodelreg.product.durable import write_fully
 from geodelreg.product.header import Georeference, Metadata, Provenance, corrected_entries
 from geodelreg.tiff import (
     CLASSIC_LIMIT,

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 
 from geodelreg.errors import UnsafeInPlaceError
 from geodelreg.product import sidecars
-from geodelreg.product.atomic import fsync_folder, staged, write_fully, write_text_atomically
+from geodelreg.product.durable import fsync_folder, replace_bytes, write_fully
 
 _VERSION = 2
 _LARGEST_BYTES = 1 << 28
@@ -93,22 +93,30 @@ class Edit:
             return State.FOREIGN
         return State.STARTED if added else State.NONE
 
-    def apply(self, raster: Path, file: BinaryIO) -> None:
-        """Edit the file; killed at any point, it reads as before or as after."""
+    def apply(self, raster: Path, file: BinaryIO, scratch: Path) -> None:
+        """Edit the file; killed at any point, it reads as before or as after.
+
+        Parameters
+        ----------
+        raster : Path
+        file : binary file
+        scratch : Path
+            Folder for drafts of side files.
+        """
         descriptor = file.fileno()
         write_fully(descriptor, self.tail, self.size)
         os.fsync(descriptor)
         write_fully(descriptor, self.new_pointer, self.pointer_at)
         os.fsync(descriptor)
         for change in self.sidecars:
-            _replace(raster, change.name, change.after)
+            _replace(raster, change.name, change.after, scratch)
 
-    def undo(self, raster: Path, file: BinaryIO) -> None:
-        """Take the edit back, from whatever point it had come to."""
+    def undo(self, raster: Path, file: BinaryIO, scratch: Path) -> None:
+        """Take the edit back, from whatever point it had come to; parameters as of `apply`."""
         descriptor = file.fileno()
         for change in reversed(self.sidecars):
             if _content(raster, change.name) != change.before:
-                _replace(raster, change.name, change.before)
+                _replace(raster, change.name, change.before, scratch)
         if _read(file, self.pointer_at, len(self.old_pointer)) != self.old_pointer:
             write_fully(descriptor, self.old_pointer, self.pointer_at)
             os.fsync(descriptor)
@@ -156,22 +164,21 @@ def load(raster: Path) -> list[Edit]:
         ) from error
 
 
-def save(raster: Path, edits: Sequence[Edit]) -> None:
+def save(raster: Path, edits: Sequence[Edit], scratch: Path) -> None:
     """Replace the record; without edits it is removed.
 
     Raises
     ------
-    OutputUnwritableError, FileLockedError
     OSError
     """
-    path = record_path(raster)
-    if edits:
-        encoded = [_encoded(edit) for edit in edits]
-        document = {"version": _VERSION, "sha256": _digest(encoded), "edits": encoded}
-        write_text_atomically(path, json.dumps(document, indent=1) + "\n", overwrite=True)
-    elif path.exists():
-        path.unlink()
-        fsync_folder(path.parent)
+    _replace(raster, record_path(raster).name, encoded(edits) if edits else None, scratch)
+
+
+def encoded(edits: Sequence[Edit]) -> bytes:
+    """Content of a record."""
+    items = [_encoded(edit) for edit in edits]
+    document = {"version": _VERSION, "sha256": _digest(items), "edits": items}
+    return json.dumps(document, indent=1).encode() + b"\n"
 
 
 def _digest(edits: Any) -> str:
@@ -240,11 +247,10 @@ def _content(raster: Path, name: str) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _replace(raster: Path, name: str, content: bytes | None) -> None:
+def _replace(raster: Path, name: str, content: bytes | None, scratch: Path) -> None:
     path = raster.with_name(name)
     if content is None:
         path.unlink(missing_ok=True)
         fsync_folder(path.parent)
         return
-    with staged(path, overwrite=True) as draft:
-        draft.write_bytes(content)
+    replace_bytes(path, content, scratch / name, raster)

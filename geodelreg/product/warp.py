@@ -18,11 +18,12 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
-from geodelreg.product.atomic import check_not_input, staged
+from geodelreg.product.atomic import staged
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
+from geodelreg.product.targets import check_not_input
 from geodelreg.product.view import corrected_view
 from geodelreg.types import Correction, Grid
 
@@ -110,8 +111,9 @@ def write_warped(
             creation = user_creation(options) if driver == "GTiff" else {}
             draft = out
             if driver != "GTiff":
-                # the name may tell of flags
-                draft = out.parent.parent / "warped" / f"{source.stem}.tif"
+                room = max(0, 240 - len(os.fsencode(out.name)))  # the name may tell of flags
+                name = f"{out.name}.{source.stem[:room]}.tif"
+                draft = out.parent.parent / "scratch" / name
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
                 notes = _warp(source, draft, content, grid, creation, options)

@@ -12,7 +12,10 @@ from typing import Any
 
 import pytest
 
-CALLS = ("write", "fsync", "ftruncate", "replace", "unlink", "mkdir", "rmdir", "copy_file_range")
+CALLS = (
+    *("write", "fsync", "ftruncate", "replace", "unlink", "mkdir", "rmdir", "copy_file_range"),
+    *("link", "chmod"),
+)
 
 
 class Fault:

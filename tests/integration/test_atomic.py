@@ -23,8 +23,9 @@ from geodelreg.errors import (
     OutputUnwritableError,
 )
 from geodelreg.options import WriteOptions
-from geodelreg.product.atomic import check_not_input, staged, write_text_atomically
+from geodelreg.product.atomic import staged, write_text_atomically
 from geodelreg.product.geotiff import write_corrected
+from geodelreg.product.targets import check_not_input
 from tests.integration.faults import (
     contents,
     names,

@@ -23,7 +23,7 @@ import rasterio
 import tifffile
 from affine import Affine
 
-from geodelreg.api import write_in_place
+from geodelreg import write_in_place
 from geodelreg.errors import (
     FileLockedError,
     OutputUnwritableError,

@@ -1,0 +1,214 @@
+"""What users call to write: the corrected rasters, and control points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.image.input_files import input_files
+from geodelreg.image.reader import open_raster
+from geodelreg.masking import parse_mask
+from geodelreg.options import WriteOptions
+from geodelreg.product.provenance import provenance_tags
+from geodelreg.types import Alignment, Correction, Gcp, Outcome
+
+AnyPath = str | PathLike[str]
+
+
+def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = None) -> list[str]:
+    """Write the MS raster with its corrected georeferencing and the same pixels.
+
+    Of several MS files all are written or none.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        As returned by `align`; one that is already aligned gives a copy with provenance.
+    target : path
+        The output; with several MS files the folder for them, made when missing.
+    options : WriteOptions, optional
+        Its `warp` resamples north-up instead of correcting the header.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    OutputExistsError, OutputIsInputError, OutputUnwritableError, LossyOutputError, ...
+        Nothing is then changed on disk.
+    """
+    from geodelreg.product.atomic import together
+    from geodelreg.product.geotiff import write_corrected
+    from geodelreg.product.sidecars import stale_beside
+    from geodelreg.product.targets import check_replaceable
+    from geodelreg.product.warp import write_warped
+
+    options = options or WriteOptions()
+    tags = provenance_tags(alignment)
+    notes: list[str] = []
+    with (
+        _targets(alignment, Path(target)) as pairs,
+        together([out for _, out in pairs], lambda: _inputs(alignment)),
+    ):
+        for path, out in pairs:
+            check_replaceable(out, options.overwrite, stale_beside(out, path))
+        for path, out in pairs:
+            correction, gcps = _of_file(alignment, path)
+            if options.warp:
+                notes += write_warped(path, out, correction, alignment.reference, tags, options)
+            else:
+                notes += write_corrected(path, out, correction, gcps, tags, options)
+    return notes
+
+
+def write_in_place(alignment: Alignment) -> list[str]:
+    """Correct the headers of the MS files themselves, of all or none; `revert` takes it back.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    UnsafeInPlaceError, FileLockedError, OutputUnwritableError
+        The files are then as they were.
+    """
+    from geodelreg.product.atomic import tidy, together
+    from geodelreg.product.inplace import edit_in_place
+
+    if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
+        tidy(map(Path, alignment.source_paths))
+        return []
+    tags = provenance_tags(alignment)
+    notes: list[str] = []
+    with together(map(Path, alignment.source_paths)):
+        for name in alignment.source_paths:
+            notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
+    return notes
+
+
+def revert(*paths: AnyPath) -> None:
+    """Take back what `write_in_place` did: the files are bit by bit what they were.
+
+    Raises
+    ------
+    UnsafeInPlaceError, OutputUnwritableError, FileLockedError, RasterNotFoundError
+        For one of the files; none is changed.
+    """
+    from geodelreg.product.inplace import revert as revert_files
+
+    revert_files(*map(Path, paths))
+
+
+def export_gcps(
+    alignment: Alignment,
+    path: AnyPath,
+    format: str | None = None,  # noqa: A002 - the field's word
+    overwrite: bool = False,
+) -> None:
+    """Write the kept tie points as ground control points of the MS raster.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    path : path
+        ``-`` is standard output.
+    format : str, optional
+        One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
+    overwrite : bool
+
+    Raises
+    ------
+    GcpFormatError
+        If the format is not known.
+    OutputExistsError, OutputIsInputError, OutputUnwritableError
+    """
+    from geodelreg.product.atomic import together
+    from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
+
+    gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
+    with together(inputs=lambda: _inputs(alignment)):
+        write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
+
+
+def input_paths(names: Iterable[str], allow: str) -> list[Path]:
+    """Whatever must not be written to when the files of some names are read.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Rasters and masks.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
+
+    Returns
+    -------
+    list of Path
+        The files, those that they consist of, and the side files that they have or could have.
+    """
+    from geodelreg.product.sidecars import possible_sidecars
+
+    files = input_files(names, allow)
+    return [*files, *(side for file in files for side in possible_sidecars(file))]
+
+
+def _inputs(alignment: Alignment) -> list[Path]:
+    options = alignment.options
+    masks = [parse_mask(mask).path for mask in (*options.masks, *options.pan_masks)]
+    names = [*alignment.source_paths, alignment.reference_path, *masks]
+    return input_paths(names, options.allow)
+
+
+@contextmanager
+def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Path]]]:
+    """MS files with their outputs; the folder for several is made, and taken back on an error."""
+    from geodelreg.product.targets import STDOUT
+
+    if target == STDOUT:
+        raise UsageError("A raster cannot be written to standard output", "Name a file.")
+    sources = [Path(path) for path in alignment.source_paths]
+    if len(sources) == 1:
+        yield [(sources[0], target)]
+        return
+    made = [folder for folder in (target, *target.parents) if not folder.exists()]
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputUnwritableError(
+            f"{target} cannot be made a folder ({error.strerror})",
+            "With several MS files the output is a folder; name another one.",
+        ) from error
+    try:
+        yield [(path, target / path.name) for path in sources]
+    except BaseException:
+        with suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
+    """Correction and GCPs of one MS file; files on other grids share the ground, not the pixels."""
+    from geodelreg.product.gcps import gcps_from_alignment
+
+    gcps, shared = gcps_from_alignment(alignment), alignment.correction
+    if len(alignment.source_paths) == 1:
+        return shared, gcps
+    with open_raster(path, allow=alignment.options.allow) as reader:
+        own = reader.grid.transform
+    if own == shared.original:
+        return shared, gcps
+    corrected = shared.apply(own)
+    to_own = ~own @ shared.original
+    moved = tuple(
+        replace(gcp, column=column, row=row)
+        for gcp, (column, row) in ((gcp, to_own @ (gcp.column, gcp.row)) for gcp in gcps)
+    )
+    return replace(shared, original=own, corrected=corrected), moved
