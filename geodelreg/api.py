@@ -9,6 +9,8 @@ from os import PathLike
 from pathlib import Path
 from time import perf_counter
 
+from geodelreg.door.names import as_path
+from geodelreg.door.opening import as_allowed
 from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
@@ -26,7 +28,7 @@ from geodelreg.pipeline.check import (
 )
 from geodelreg.pipeline.register import correction_of, register
 from geodelreg.pipeline.solve import Solution
-from geodelreg.pipeline.state import Pair, Progress
+from geodelreg.pipeline.state import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.provenance import fingerprint, provenance_tags, versions
 from geodelreg.types import (
@@ -158,16 +160,13 @@ def check(
     start = perf_counter()
     with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
-        report = _part_of(progress, 0, count + 1)
+        report = part_of(progress, 0, count + 1)
         alignment, misalignment = _examine(rasters, options, report, start)
         bands = [
             _check_band(
-                rasters,
-                replace(options, band=number),
-                limit_px,
-                _part_of(progress, number, count + 1),
+                rasters, replace(options, band=n), limit_px, part_of(progress, n, count + 1)
             )
-            for number in range(1, count + 1)
+            for n in range(1, count + 1)
         ]
     return Check(
         judge_misalignment(misalignment, limit_px),
@@ -196,14 +195,6 @@ def _check_band(
     outcome = judge_misalignment(misalignment, limit_px)
     alignment = _alignment(rasters, pair, solution)
     return band_check((options.band, name), alignment, misalignment, limit_px, outcome)
-
-
-def _part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """Progress of one of several equal parts."""
-    if progress is None:
-        return None
-    show = progress
-    return lambda fraction, step: show((number + fraction) / count, step)
 
 
 def _examine(
@@ -264,6 +255,7 @@ def _paths(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
     return tuple(str(path) for path in source)
 
 
+@as_allowed
 def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = None) -> list[str]:
     """Write the MS raster with its corrected georeferencing and the same pixels.
 
@@ -301,6 +293,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     return notes
 
 
+@as_allowed
 def write_in_place(alignment: Alignment) -> list[str]:
     """Correct the headers of the MS files themselves; `revert` takes it back.
 
@@ -334,6 +327,7 @@ def revert(path: AnyPath) -> None:
     revert_file(Path(path))
 
 
+@as_allowed
 def export_gcps(
     alignment: Alignment,
     path: AnyPath,
@@ -366,7 +360,7 @@ def export_gcps(
 
 def _targets(alignment: Alignment, target: Path) -> list[tuple[Path, Path]]:
     """MS files with their outputs."""
-    sources = [Path(path) for path in alignment.source_paths]
+    sources = [as_path(path) for path in alignment.source_paths]
     if len(sources) == 1:
         return [(sources[0], target)]
     try:

@@ -75,6 +75,7 @@ def gcps(
     """
     configure_logging(verbose, quiet, debug)
     keep_to(allow)
+    from geodelreg.door.opening import allowing
     from geodelreg.image.reader import open_raster
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
 
@@ -91,7 +92,8 @@ def gcps(
     points, crs_wkt = read_gcps(source, from_format, context)
     if crs_wkt is not None:
         points = _in_crs(points, crs_wkt, context.source.crs_wkt)
-    write_gcps(target, points, to_format, context=context, overwrite=overwrite)
+    with allowing(allow):
+        write_gcps(target, points, to_format, context=context, overwrite=overwrite)
     if not quiet:
         click.echo(f"{target}: {len(points)} points", err=True)
 
