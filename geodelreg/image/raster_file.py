@@ -238,10 +238,14 @@ class RasterFile:
                 f"{window.row + window.height} cannot be decoded ({reason})",
                 "The file is truncated or damaged: copy or download it again.",
             ) from error
+        nodata = [level.nodatavals[number - 1] for number in numbers]
+        differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
+        if all(one is not None and not one.any() for one in differing):
+            # most of a sparse raster: as fast as GDAL finds that nothing is there
+            return np.zeros(raw.shape, dtype=np.float32), np.zeros(raw.shape, dtype=np.bool_)
         with np.errstate(over="ignore", invalid="ignore"):
             data = raw.astype(np.float32)
-        nodata = [level.nodatavals[number - 1] for number in numbers]
-        valid = _validity(raw, data, nodata, masks)
+        valid = _validity(raw, data, differing, masks)
         if valid is not None:
             data[~valid] = 0
         return data, valid
@@ -281,11 +285,10 @@ def _read(level: DatasetReader, numbers: Sequence[int], window: Window) -> NDArr
 def _validity(
     raw: NDArray[Any],
     data: Float32Array,
-    nodata: Sequence[float | None],
+    differing: Sequence[BoolArray | None],
     masks: Sequence[tuple[slice | int, BoolArray]],
 ) -> BoolArray | None:
     """Everything that speaks against a pixel; None when nothing can."""
-    differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
     if raw.dtype.kind in "iu" and not masks and all(mask is None for mask in differing):
         return None
     with np.errstate(invalid="ignore"):
