@@ -10,6 +10,8 @@ from __future__ import annotations
 import os
 import time
 from bisect import bisect_left
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -18,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from geodelreg.door import mentions
-from geodelreg.door.formats import HEAD_BYTES, alone, format_of, is_markup, needed_for
+from geodelreg.door.formats import BY_SIGNATURE, HEAD_BYTES, alone, format_of, is_markup, needed_for
 from geodelreg.door.mentions import Mention
 from geodelreg.door.names import (
     ALL,
@@ -37,6 +39,8 @@ from geodelreg.tiff import TiffFile
 
 if TYPE_CHECKING:
     from zipfile import Path as ZipPath
+
+    from rasterio.io import DatasetReader
 
     AnyFile = Path | ZipPath
 
@@ -116,7 +120,8 @@ class Inspection:
         if kind is None and is_markup(head):
             raise RasterUnreadableError(
                 f"{file} is not a raster that GDAL can open: it is a text, XML or the like",
-                "Give a GeoTIFF or another raster format that gdalinfo reads.",
+                "Give a GeoTIFF or another raster format that gdalinfo reads; --allow all opens "
+                "those that are XML.",
             )
         needed = LOCAL if kind is None else needed_for(kind)
         if needed not in (LOCAL, self.allow):
@@ -176,7 +181,10 @@ class Inspection:
 
     def _special(self, file: AnyFile, item: Mention, parents: tuple[str, ...]) -> None:
         """A name that is no path: of a subdataset, inside an archive, or on the network."""
-        if self.allow == ALL or needed_access(item.name) == NETWORK:
+        if self.allow == ALL:
+            return
+        if needed_access(item.name) == NETWORK:
+            _check_remote(item.name, file)
             return
         folder = _folder(file) if item.relative else Path()
         container = container_of(item.name, self.allow, folder)
@@ -322,6 +330,32 @@ def _check_opens(source: AnyFile, parent: AnyFile) -> None:
             f"{source}, a source of {parent}, is not a raster that may be opened ({error})",
             "Restore it, or build the VRT again.",
         ) from error
+
+
+def _check_remote(name: str, parent: AnyFile) -> None:
+    """Refuse a source on the network that GDAL would not open as one of `BY_SIGNATURE`."""
+    from rasterio.errors import RasterioError
+    from rasterio.io import DatasetReader
+
+    try:
+        without_side_files(lambda: DatasetReader(name, driver=list(BY_SIGNATURE))).close()
+    except (RasterioError, OSError, ValueError, SystemError) as error:
+        raise RasterUnreadableError(
+            f"{name}, a source of {parent}, is not a raster that may be opened ({error})",
+            "Check the address and the access to it, or build the VRT again.",
+        ) from error
+
+
+def without_side_files(opening: Callable[[], DatasetReader]) -> DatasetReader:
+    """Open with a setting that, on a thread of its own, no other thread of the process sees."""
+    import rasterio
+
+    def run() -> DatasetReader:
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
+            return opening()
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(run).result()
 
 
 def _is_below(path: AnyFile, folder: AnyFile) -> bool:

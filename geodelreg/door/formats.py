@@ -200,14 +200,14 @@ def needed_for(driver: str) -> str:
     return {"network": NETWORK, "all": ALL}.get(reach, LOCAL)
 
 
-def reachable(allow: str) -> tuple[str, ...]:
-    """Formats that reach nothing beyond `allow`, those with names of files included."""
-    return tuple(sorted(name for name, one in FORMATS.items() if one.reach in _REACHES[allow]))
-
-
 def alone() -> tuple[str, ...]:
     """Formats that reach nothing but side files of their own name."""
     return tuple(sorted(name for name, one in FORMATS.items() if one.reach == "alone"))
+
+
+def unseen() -> tuple[str, ...]:
+    """Formats for what is on the network: web services, and those that cannot name local files."""
+    return tuple(sorted(n for n, one in FORMATS.items() if one.reach in ("alone", "network")))
 
 
 def skip_the_rest(environment: MutableMapping[str, str], allow: str) -> None:

@@ -27,7 +27,8 @@ _BASE = ":::BASE:::"
 _HFA_MOST_NODES = 100_000
 _HFA_MOST_BYTES = 1_000_000
 _HFA_NAMING = (b"externalrasterdms", b"dependentfile", b"rrdnameslist")
-_PATH = re.compile(rb"[ -~]*[/\\][ -~]{2,}|[ -~]{2,}[/\\][ -~]*")
+_RUN = re.compile(rb"[^\0-\x1f]*[/\\][^\0-\x1f]*")
+_LONGEST_RUN = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,14 +231,30 @@ def in_hfa(file: AnyFile, folder: Sequence[str]) -> list[Mention]:
             values = b"\0".join(_hfa_values(opened))
     except (struct.error, OSError, ValueError) as error:
         raise refuse(f"{file}: names of files inside cannot be checked ({error})", ALL) from error
-    outside = _PATH.search(values)
+    outside = next((path for run in _RUN.findall(values) for path in _reached(file, run)), None)
     if outside is not None:
-        raise refuse(f"{file} names {outside[0].decode()}, which is not in its folder", ALL)
+        raise refuse(f"{file} names {outside}, which is not in its folder", ALL)
     return [
         Mention(name, relative=True, needed=False)
         for name in folder
         if name != file.name and os.fsencode(name).lower() in values.lower()
     ]
+
+
+def _reached(file: AnyFile, run: bytes) -> Iterator[str]:
+    """Files that a path in an HFA value reaches; where in the run it begins is not known.
+
+    Paths of the machine that an image was made on are common, and reach nothing.
+    """
+    if len(run) > _LONGEST_RUN:
+        raise refuse(f"{file} names a path of {len(run)} letters", ALL)
+    for start in range(len(run)):
+        name = os.fsdecode(run[start:]).partition("(")[0]
+        if "/" not in name and "\\" not in name:
+            return
+        # a path that is too long is none, for `os`
+        if os.path.isfile(Path(str(file.parent), name)):  # noqa: PTH113
+            yield name
 
 
 def _hfa_values(file: IO[bytes]) -> Iterator[bytes]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -12,8 +11,8 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from geodelreg.door.files import Inspection, container_of
-from geodelreg.door.formats import BY_SIGNATURE, alone, reachable
+from geodelreg.door.files import Inspection, container_of, without_side_files
+from geodelreg.door.formats import BY_SIGNATURE, alone, unseen
 from geodelreg.door.names import (
     ALL,
     LOCAL,
@@ -122,8 +121,7 @@ def look_at(name: str, allow: str) -> Entry:
     if allow == ALL:
         return Entry(spoken)
     if needed_access(name) == NETWORK:
-        known = set(reachable(allow)) - {"VRT", "DIMAP", "TIL"}
-        return Entry(spoken, tuple(sorted(known)), with_side_files=False)
+        return Entry(spoken, unseen(), with_side_files=False)
     file = container_of(name, allow)
     if file is not None:
         return _of_file(file, spoken, part, allow)
@@ -157,7 +155,7 @@ def open_entry(entry: Entry, **options: Any) -> DatasetReader:
     if entry.with_side_files:
         with nullcontext() if hasenv() else rasterio.Env():
             return DatasetReader(entry.name, **options)
-    return _without_side_files(lambda: DatasetReader(entry.name, **options))
+    return without_side_files(lambda: DatasetReader(entry.name, **options))
 
 
 def open_raster(name: str | os.PathLike[str], **options: Any) -> DatasetReader:
@@ -174,15 +172,3 @@ def open_raster(name: str | os.PathLike[str], **options: Any) -> DatasetReader:
     if driver is not None:
         return open_entry(Entry(given, (driver,)), **options)
     return open_entry(look_at(given, _allowed.get()), **options)
-
-
-def _without_side_files(opening: Callable[[], DatasetReader]) -> DatasetReader:
-    """Open with a setting that, on a thread of its own, no other thread of the process sees."""
-    import rasterio
-
-    def run() -> DatasetReader:
-        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
-            return opening()
-
-    with ThreadPoolExecutor(1) as thread:
-        return thread.submit(run).result()

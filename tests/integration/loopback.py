@@ -5,9 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-# serves /short.tif: the beginning of a file, then the connection is cut
+# serves /whole.tif, an /x.mrf that writes to `victim`, and of /short.tif the beginning, whereupon
+# the connection is cut
 SERVER = """
-import http.server, sys
+import http.server, os, sys
+FILES = {
+    "/whole.tif": open(sys.argv[2], "rb").read(),
+    "/x.mrf": b"<MRF_META><Raster><Size x='64' y='64' c='1'/><Compression>NONE</Compression>"
+    b"<DataType>Byte</DataType><DataFile>" + os.fsencode(os.path.dirname(sys.argv[1]))
+    + b"/victim</DataFile></Raster><CachedSource><Source>/whole.tif</Source></CachedSource>"
+    b"</MRF_META>",
+}
 class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self):
         with open(sys.argv[1], "a") as log:
@@ -23,6 +31,19 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(end + 1 - start))
             self.end_headers()
             self.wfile.write(data[start:end + 1])
+        elif self.path in FILES:
+            file = FILES[self.path]
+            start, _, end = self.headers.get("Range", "=0-").partition("=")[2].partition("-")
+            part = file[int(start):min(int(end or len(file)), len(file) - 1) + 1]
+            self.send_response(206 if "Range" in self.headers else 200)
+            if "Range" in self.headers:
+                last = int(start) + len(part) - 1
+                self.send_header("Content-Range", f"bytes {start}-{last}/{len(file)}")
+            self.send_header("Content-Length", str(len(part)))
+            self.send_header("Accept-Ranges", "bytes")
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(part)
         elif self.path == "/short.tif":
             self.send_response(200)
             self.send_header("Content-Length", str(len(data)))

@@ -235,3 +235,17 @@ def test_the_command_sends_no_request_and_says_what_allows_it(
         if "://" in name:
             assert "add --allow network" in result.stderr
     assert server.requests == []
+
+
+def test_a_source_on_the_network_is_looked_at_before_it_is_opened(
+    tmp_path: Path, server: Server
+) -> None:
+    for name, served in (("/whole.tif", True), ("/x.mrf", False)):
+        path = vrt(tmp_path, SOURCE.format(f"/vsicurl/{server.address}{name}"))
+        if served:
+            read_some(path, NETWORK)
+        else:
+            with pytest.raises(RasterUnreadableError, match=r"x\.mrf, a source of"):
+                read_some(path, NETWORK)
+            assert "/x.mrf" in server.requests
+            assert not (tmp_path / "victim").exists()
