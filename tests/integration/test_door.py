@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -460,3 +461,12 @@ def test_an_item_in_cdata_ends_no_metadata(folder: Path) -> None:
         assert out.tags()["a"] == "x </Item> y"
         assert out.tags()["b"] == "kept"
         assert out.tags()["GEODELREG_VERSION"] == TAGS["GEODELREG_VERSION"]
+
+
+def test_no_raster_is_read_but_through_the_door() -> None:
+    for path in (ROOT / "geodelreg").rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "rasterio.open":
+                assert ast.unparse(call.args[1]) in ("'w'", "'r+'"), path
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "DatasetReader":
+                assert path.parent.name == "door", path
