@@ -146,7 +146,7 @@ _MARKS = (
     ("RPFTOC", rb"\A.{0,9} *A\.TOC"),
     ("FAST", rb"ACQUISITION DATE"),
     ("CALS", rb"srcdocid:"),
-    ("SAFE", rb"\APK\x03\x04"),
+    ("ZIP", rb"\APK\x03\x04"),
     ("TIL", rb"numTiles\s*="),
 )
 """What GDAL takes as a sign of formats that can name files; the first that is found."""

@@ -37,6 +37,7 @@ _WEB_SERVICES = re.compile(
     r"(WMS|WCS|WMTS|EEDA|EEDAI|PLMOSAIC|PLSCENES|STACTA|STACIT|HTTP|NGW|OAPIF\w*|OGCAPI|DAAS):",
     re.IGNORECASE,
 )
+_SCHEMES = re.compile(r"(?:^|[\"/:,{ ])([A-Za-z][\w+-]*)://")
 _ZIP = re.compile(r"(?:/vsizip/|zip://)(.*)", re.DOTALL)
 
 
@@ -66,6 +67,9 @@ def gdal_name(name: str) -> str:
     """Name under which GDAL and rasterio open what the user has named."""
     if is_local(name):
         return os.path.join(".", name) if is_special(name) else name  # noqa: PTH118
+    inside = in_zip(name)
+    if inside is not None and "}" not in str(inside.root.filename):
+        return f"/vsizip/{{{inside.root.filename}}}/{inside.at}"  # as it was understood here
     prefix, colon, rest = name.partition(":")
     # rasterio lists subdatasets in lower case
     return prefix.upper() + colon + rest if prefix.upper() in _CONTAINERS else name
@@ -113,7 +117,7 @@ def needed_access(name: str) -> str:
     if not is_special(name):
         return LOCAL
     handlers = set(re.findall(r"/(vsi\w+)", name))
-    schemes = {one for word in re.findall(r"([\w+.-]+)://", name) for one in word.split("+")}
+    schemes = {one for word in _SCHEMES.findall(name) for one in word.split("+")}
     if handlers & _OTHER_HANDLERS or schemes & _OTHER_SCHEMES:
         return ALL
     if handlers - _LOCAL_HANDLERS or schemes - _LOCAL_SCHEMES or _WEB_SERVICES.match(name):

@@ -113,6 +113,8 @@ def look_at(name: str, allow: str) -> Entry:
     RasterNotFoundError, RasterUnreadableError, AccessNotAllowedError
     """
     check_name(name, allow)
+    if not is_local(name):
+        name = name.removeprefix("file://")
     spoken, part = gdal_name(name), subdataset_of(name)
     if is_local(name):
         if not is_there(name):
