@@ -24,7 +24,7 @@ from geodelreg.pipeline.check import (
 )
 from geodelreg.pipeline.register import correction_of, register
 from geodelreg.pipeline.solve import Solution
-from geodelreg.pipeline.state import Pair, Progress
+from geodelreg.pipeline.state import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
@@ -154,16 +154,13 @@ def check(
     start = perf_counter()
     with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
-        report = _part_of(progress, 0, count + 1)
+        report = part_of(progress, 0, count + 1)
         alignment, misalignment = _examine(rasters, options, report, start)
         bands = [
             _check_band(
-                rasters,
-                replace(options, band=number),
-                limit_px,
-                _part_of(progress, number, count + 1),
+                rasters, replace(options, band=n), limit_px, part_of(progress, n, count + 1)
             )
-            for number in range(1, count + 1)
+            for n in range(1, count + 1)
         ]
     return Check(
         judge_misalignment(misalignment, limit_px),
@@ -192,14 +189,6 @@ def _check_band(
     outcome = judge_misalignment(misalignment, limit_px)
     alignment = _alignment(rasters, pair, solution)
     return band_check((options.band, name), alignment, misalignment, limit_px, outcome)
-
-
-def _part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
-    """Progress of one of several equal parts."""
-    if progress is None:
-        return None
-    show = progress
-    return lambda fraction, step: show((number + fraction) / count, step)
 
 
 def _examine(

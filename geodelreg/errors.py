@@ -47,7 +47,7 @@ class RasterUnreadableError(GeodelregError):
 
 
 class AccessNotAllowedError(GeodelregError):
-    """A name, or a file behind it, reaches beyond what ``allow`` lets GDAL open."""
+    """A name, a file behind it or beside it reaches beyond what ``allow`` lets GDAL open."""
 
 
 class MissingGeoreferenceError(GeodelregError):

@@ -114,9 +114,10 @@ class AlignOptions:
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
     allow: str = _knob(
         "local",
-        "What names of rasters, and VRTs, may open. local: files of this machine, also in "
-        "archives; network: addresses and web services as well; all: whatever GDAL can, also "
-        "databases, Python code in VRTs and raw bytes of any file.",
+        "What names of rasters, and files, may open. local: files of this machine, also in "
+        "archives, of formats that reach no others unseen; network: addresses and web services "
+        "as well; all: whatever GDAL can, also HDF5, databases, Python code in VRTs and raw bytes "
+        "of any file.",
         ACCESS,
     )
     seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")

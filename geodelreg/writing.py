@@ -8,6 +8,8 @@ from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
+from geodelreg.door.names import as_path
+from geodelreg.door.opening import as_allowed
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.image.input_files import input_files
 from geodelreg.image.reader import open_raster
@@ -19,6 +21,7 @@ from geodelreg.types import Alignment, Correction, Gcp, Outcome
 AnyPath = str | PathLike[str]
 
 
+@as_allowed
 def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = None) -> list[str]:
     """Write the MS raster with its corrected georeferencing and the same pixels.
 
@@ -67,6 +70,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     return notes
 
 
+@as_allowed
 def write_in_place(alignment: Alignment) -> list[str]:
     """Correct the headers of the MS files themselves, of all or none; `revert` takes it back.
 
@@ -107,6 +111,7 @@ def revert(*paths: AnyPath) -> None:
     revert_files(*map(Path, paths))
 
 
+@as_allowed
 def export_gcps(
     alignment: Alignment,
     path: AnyPath,
@@ -173,7 +178,7 @@ def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Pa
 
     if target == STDOUT:
         raise UsageError("A raster cannot be written to standard output", "Name a file.")
-    sources = [Path(path) for path in alignment.source_paths]
+    sources = [as_path(path) for path in alignment.source_paths]
     if len(sources) == 1:
         yield [(sources[0], target)]
         return

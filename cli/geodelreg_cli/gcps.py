@@ -75,6 +75,7 @@ def gcps(
     """
     configure_logging(verbose, quiet, debug)
     keep_to(allow)
+    from geodelreg.door.opening import allowing
     from geodelreg.image.reader import open_raster
     from geodelreg.product.atomic import together
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
@@ -94,7 +95,7 @@ def gcps(
     if crs_wkt is not None:
         points = _in_crs(points, crs_wkt, context.source.crs_wkt)
     rasters = [raster] if reference is None else [raster, reference]
-    with together(inputs=lambda: [source, *input_paths(rasters, allow)]):
+    with allowing(allow), together(inputs=lambda: [source, *input_paths(rasters, allow)]):
         write_gcps(target, points, to_format, context=context, overwrite=overwrite)
     if not quiet:
         click.echo(f"{target}: {len(points)} points", err=True)

@@ -7,6 +7,7 @@ there: ``search_radius_px`` is ``--search-radius PX``.
 from __future__ import annotations
 
 import inspect
+import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
@@ -190,11 +191,16 @@ def start_run(given: Mapping[str, Any]) -> None:
 
 
 def keep_to(allow: str) -> None:
-    """Take what fetches out of GDAL, which is not loaded yet, unless the user allows it."""
-    from geodelreg.image.access import LOCAL, close_the_network
+    """Take formats that can reach further out of GDAL, which is not loaded yet."""
+    from geodelreg.door.formats import skip_the_rest
+    from geodelreg.door.names import ALL
 
-    if allow == LOCAL:
-        close_the_network(os.environ)
+    if allow != ALL:
+        skip_the_rest(os.environ, allow)
+        # GDAL says so of each format that this build of it does not have
+        logging.getLogger("rasterio._env").addFilter(
+            lambda record: "Unable to find driver" not in record.getMessage()
+        )
 
 
 def ms_and_pan(rasters: tuple[str, ...]) -> tuple[tuple[str, ...], str]:

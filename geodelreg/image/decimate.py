@@ -19,7 +19,7 @@ class Share(NamedTuple):
     total : (B, h, w) float32
         Sums over the piece's pixels.
     area : (B, h, w) or (1, h, w) float
-        Numbers of valid pixels; one plane serves all bands.
+        Numbers of valid pixels; one plane serves all bands.  Both are (1, 1, 1) where they are 0.
     """
 
     cells: tuple[slice, slice]
@@ -79,16 +79,17 @@ class BoxAverage:
         """
         rows = _Cells(row, data.shape[1], self._origin[1], self._ratio[1], self._counts[1])
         columns = _Cells(column, data.shape[2], self._origin[0], self._ratio[0], self._counts[0])
+        cells, nothing = (rows.cells, columns.cells), np.zeros((1, 1, 1), dtype=np.float32)
+        if valid is not None and not valid.any():
+            return Share(cells, nothing, nothing)
         if valid is None:
-            total = columns.fold(rows.fold(data, None, 1), None, 2)
+            total = columns.fold(rows.fold(data, None, 1), None, 2) if data.any() else nothing
             area = np.multiply.outer(rows.areas(), columns.areas())[None]
-            return Share((rows.cells, columns.cells), total, area)
+            return Share(cells, total, area)
         share = valid.astype(np.float32)
         row_area = rows.fold(share, None, 1, constant=True)
         total = columns.fold(rows.fold(data, share, 1), row_area, 2)
-        return Share(
-            (rows.cells, columns.cells), total, columns.fold(row_area, None, 2, constant=True)
-        )
+        return Share(cells, total, columns.fold(row_area, None, 2, constant=True))
 
     def take(self, share: Share) -> None:
         """Add what a piece amounts to."""

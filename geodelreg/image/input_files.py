@@ -8,12 +8,11 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from geodelreg.door.names import LOCAL, is_local
 from geodelreg.errors import GeodelregError
-from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.mask_vector import is_vector
 from geodelreg.image.opening import open_dataset
-from geodelreg.image.paths import is_local
 from geodelreg.tiff import is_tiff
 
 _WITH_A_VECTOR = {

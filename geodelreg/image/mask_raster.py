@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geodelreg.door.names import LOCAL
 from geodelreg.errors import (
     AccessNotAllowedError,
     CrsTransformError,
@@ -22,7 +23,6 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.quality import hidden_values, impossible_values

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.errors import GeodelregError, MaskError, MissingExtraError
+from geodelreg.door.names import LOCAL, gdal_name, is_local, needed_access
+from geodelreg.door.vectors import EXTENSIONS, check_vector
+from geodelreg.errors import GeodelregError, MaskError, MissingExtraError, RasterUnreadableError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.image.paths import is_local
 from geodelreg.masking import AUTO, VECTOR, MaskSpec
 from geodelreg.types import BoolArray, FloatArray, Grid
 
@@ -22,10 +23,7 @@ if TYPE_CHECKING:
 Geometries = NDArray[np.object_]
 
 _GEOJSON = {".geojson", ".json"}
-_OTHERS = {
-    ".fgb", ".geojsonl", ".geojsons", ".gml", ".gpkg", ".kml", ".kmz", ".mif", ".shp", ".sqlite",
-    ".tab", ".zip",
-}  # fmt: skip
+_LINES = {".geojsonl", ".geojsons"}
 WGS84 = "OGC:CRS84"
 
 _LATTICE = 17
@@ -36,7 +34,7 @@ _MARGIN_PX = 2.0
 
 def is_vector(path: str) -> bool:
     """Whether a file's name is that of a vector file."""
-    return PurePath(path).suffix.lower() in _GEOJSON | _OTHERS
+    return PurePath(path).suffix.lower() in _GEOJSON | _LINES | EXTENSIONS
 
 
 class VectorMask:
@@ -47,6 +45,8 @@ class VectorMask:
     spec : MaskSpec
     image : Grid
         Of the full image.
+    allow : str
+        What may be opened, `AlignOptions.allow`.
 
     Attributes
     ----------
@@ -62,13 +62,15 @@ class VectorMask:
     ------
     MaskError
         If the file cannot be read or does not say where it lies.
+    AccessNotAllowedError
+        If it could be of another format than its ending says.
     MissingExtraError
         If its format needs pyogrio and that is not installed.
     """
 
     kind, band, covered_share = VECTOR, None, 1.0
 
-    def __init__(self, spec: MaskSpec, image: Grid) -> None:
+    def __init__(self, spec: MaskSpec, image: Grid, allow: str = LOCAL) -> None:
         from shapely import STRtree
 
         self.path = spec.path
@@ -78,7 +80,7 @@ class VectorMask:
                 "Drop what follows the =; everything that a geometry touches is hidden.",
             )
         self._image = image
-        geometries, crs = _read(spec.path)
+        geometries, crs = _read(spec.path, allow)
         wkt = _wkt(spec.path, crs, geometries)
         self._shapes = _in_pixels(spec.path, geometries, wkt, image)
         self.is_elsewhere = bool(len(geometries)) and not len(self._shapes)
@@ -103,23 +105,28 @@ class VectorMask:
         return np.asarray(burned > 0)
 
 
-def _read(path: str) -> tuple[Geometries, str]:
+def _read(path: str, allow: str) -> tuple[Geometries, str]:
     """Geometries of a file, and its CRS in any form that pyproj knows."""
     if is_local(path) and not Path(path).is_file():
         raise MaskError(f"the mask {path} does not exist", "Check the path.")
-    if PurePath(path).suffix.lower() in _GEOJSON and is_local(path):
-        return _read_geojson(path)
-    return _read_with_pyogrio(path)
+    suffix = PurePath(path).suffix.lower()
+    if suffix in _GEOJSON | _LINES and is_local(path):
+        return _read_geojson(path, by_line=suffix in _LINES)
+    if suffix not in EXTENSIONS and needed_access(path) == LOCAL:
+        raise MaskError(f"the mask {path} is GeoJSON in an archive", "Unpack the archive first.")
+    return _read_with_pyogrio(path, allow)
 
 
-def _read_geojson(path: str) -> tuple[Geometries, str]:
+def _read_geojson(path: str, by_line: bool) -> tuple[Geometries, str]:
     from shapely.errors import ShapelyError
     from shapely.geometry import shape
 
     try:
-        document = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-        found = [shape(member) for member in _members(document)]
-        crs = _legacy_crs(document)
+        text = Path(path).read_text(encoding="utf-8-sig")
+        lines = [line.strip("\x1e \r\t") for line in text.split("\n")] if by_line else [text]
+        documents = [json.loads(line) for line in lines if line]
+        found = [shape(member) for document in documents for member in _members(document)]
+        crs = _legacy_crs(documents[0])
     except (
         OSError,
         ValueError,
@@ -153,7 +160,7 @@ def _legacy_crs(document: dict[str, Any]) -> str:
     return WGS84 if member is None else str(member["properties"]["name"])
 
 
-def _read_with_pyogrio(path: str) -> tuple[Geometries, str]:
+def _read_with_pyogrio(path: str, allow: str) -> tuple[Geometries, str]:
     try:
         import pyogrio
         from pyogrio.raw import read
@@ -164,17 +171,20 @@ def _read_with_pyogrio(path: str) -> tuple[Geometries, str]:
         ) from error
     from shapely import from_wkb
 
+    name = gdal_name(path)
     try:
-        layers = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
+        if PurePath(path).suffix.lower() in EXTENSIONS:
+            check_vector(path, allow)
+        layers = [str(name) for name, kind in pyogrio.list_layers(name) if kind is not None]
         if len(layers) != 1:
             raise MaskError(
                 f"the mask {path} has {len(layers)} layers with geometries"
                 + (f" ({', '.join(layers)})" if layers else ""),
                 "A mask has one: ogr2ogr -nln mask one.gpkg FILE LAYER.",
             )
-        about, _, binary, _ = read(path, layer=layers[0], columns=[], force_2d=True)
+        about, _, binary, _ = read(name, layer=layers[0], columns=[], force_2d=True)
         found = from_wkb(binary)
-    except (RuntimeError, ValueError, OSError) as error:
+    except (RuntimeError, ValueError, OSError, RasterUnreadableError) as error:
         reason = " ".join(str(error).split())
         raise MaskError(
             f"the mask {path} cannot be read ({reason})",

@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from geodelreg.image.access import LOCAL, check_name
+from geodelreg.door.names import LOCAL, check_name
 from geodelreg.image.mask_raster import RasterMask
 from geodelreg.image.mask_vector import VectorMask, is_vector
 from geodelreg.masking import MaskSpec, MaskUse, Ranges, parse_mask
@@ -61,7 +61,9 @@ class Masks:
             check_name(spec.path, allow)
             vector = is_vector(spec.path)
             self._masks.append(
-                VectorMask(spec, image) if vector else RasterMask(spec, image, stack, allow=allow)
+                VectorMask(spec, image, allow)
+                if vector
+                else RasterMask(spec, image, stack, allow=allow)
             )
             self._hide.append(spec.hide)
         self._hidden = np.zeros(len(self._masks) + 1, dtype=np.int64)

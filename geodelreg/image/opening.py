@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from affine import Affine
 
+from geodelreg.door.names import LOCAL, check_name, gdal_name, is_local
+from geodelreg.door.opening import look_at, open_entry
 from geodelreg.errors import (
     MissingCrsError,
     MissingGeoreferenceError,
@@ -18,11 +20,8 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
 )
-from geodelreg.fatal import check_survivable, contradiction
-from geodelreg.image.access import LOCAL, check_name, drivers
+from geodelreg.fatal import contradiction
 from geodelreg.image.environment import gdal_calls
-from geodelreg.image.paths import is_local
-from geodelreg.image.vrt_sources import check_regular, check_vrt_sources, is_vrt
 from geodelreg.types import Grid
 
 if TYPE_CHECKING:
@@ -55,21 +54,18 @@ def open_dataset(path: str, overview_level: int | None = None, allow: str = LOCA
     RasterNotFoundError, RasterUnreadableError, AccessNotAllowedError
     """
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
-    from rasterio.io import DatasetReader
 
-    stored_bytes = _check_before_opening(path, allow)
     options: dict[str, Any] = {} if overview_level is None else {"overview_level": overview_level}
     try:
+        entry = look_at(path, allow)
         with gdal_calls(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            if allow == LOCAL:
-                options["driver"] = list(drivers(with_vrt=stored_bytes is not None))
-            dataset = DatasetReader(path, **options)
+            dataset = open_entry(entry, **options)
     except (RasterioError, OSError, ValueError, SystemError) as error:
         raise _unreadable(path, error) from error
     try:
         _check_pixels(path, dataset)
-        _check_size(path, dataset, stored_bytes)
+        _check_size(path, dataset, entry.stored_bytes)
         with gdal_calls():
             overviews = dataset.tags(ns="OVERVIEWS").get("OVERVIEW_FILE", "")
         check_name(overviews, allow, f", named in {path},")
@@ -77,19 +73,6 @@ def open_dataset(path: str, overview_level: int | None = None, allow: str = LOCA
         dataset.close()
         raise
     return dataset
-
-
-def _check_before_opening(path: str, allow: str) -> int | None:
-    """Bytes on the disk behind a local name; None behind any other."""
-    check_name(path, allow)
-    if not is_local(path):
-        return None
-    file = Path(path)
-    if not file.exists():
-        raise RasterNotFoundError(f"{path} does not exist", "Check the path.")
-    check_regular(file)
-    check_survivable(file)
-    return check_vrt_sources(file, allow) if is_vrt(file) else file.stat().st_size
 
 
 def _unreadable(path: str, error: Exception) -> RasterUnreadableError | RasterNotFoundError:
@@ -112,7 +95,7 @@ def _unreadable(path: str, error: Exception) -> RasterUnreadableError | RasterNo
 
 def _check_pixels(path: str, dataset: DatasetReader) -> None:
     if dataset.count == 0 and dataset.subdatasets:
-        listed = ", ".join(dataset.subdatasets[:4])
+        listed = ", ".join(map(gdal_name, dataset.subdatasets[:4]))
         more = ", …" if len(dataset.subdatasets) > 4 else ""
         raise RasterUnreadableError(
             f"{path} is a container of {len(dataset.subdatasets)} rasters, not a raster",
@@ -156,9 +139,15 @@ def dataset_grid(path: str, dataset: DatasetReader) -> Grid:
     with gdal_calls(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         transform, crs = dataset.transform, dataset.crs
-        gcps, _ = dataset.gcps
+        gcps, gcp_crs = dataset.gcps
         rpcs = dataset.rpcs
     _check_transform(path, transform, bool(gcps), rpcs is not None)
+    if not crs and gcp_crs:
+        raise UnsupportedGeoreferenceError(
+            f"{path} is placed twice: by a geotransform, and by ground control points that hide "
+            f"its coordinate reference system; {Path(path).name}.aux.xml may hold them",
+            "Remove the points: gdal_translate -nogcp FILE OUT.tif, or remove the GCPList there.",
+        )
     if not crs:
         raise MissingCrsError(
             f"{path} has no coordinate reference system",

@@ -16,14 +16,13 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from geodelreg.door.names import LOCAL, is_local
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.access import LOCAL
 from geodelreg.image.decimate import BoxAverage, Share
 from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
-from geodelreg.image.paths import is_local
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.masking import quality_bands
 from geodelreg.types import BoolArray, Float32Array, Grid, Window
@@ -229,7 +228,7 @@ class RasterFile:
 
         try:
             with gdal_calls():
-                raw = level.read(list(numbers), window=_slices(window))
+                raw = _read(level, numbers, window)
                 masks = self._masks(numbers, window, level)
         except (RasterioError, OSError, MemoryError, ValueError, SystemError) as error:
             reason = " ".join(str(error.__cause__ or error).split())
@@ -239,10 +238,14 @@ class RasterFile:
                 f"{window.row + window.height} cannot be decoded ({reason})",
                 "The file is truncated or damaged: copy or download it again.",
             ) from error
+        nodata = [level.nodatavals[number - 1] for number in numbers]
+        differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
+        if all(one is not None and not one.any() for one in differing):
+            # most of a sparse raster: as fast as GDAL finds that nothing is there
+            return np.zeros(raw.shape, dtype=np.float32), np.zeros(raw.shape, dtype=np.bool_)
         with np.errstate(over="ignore", invalid="ignore"):
             data = raw.astype(np.float32)
-        nodata = [level.nodatavals[number - 1] for number in numbers]
-        valid = _validity(raw, data, nodata, masks)
+        valid = _validity(raw, data, differing, masks)
         if valid is not None:
             data[~valid] = 0
         return data, valid
@@ -272,14 +275,20 @@ class RasterFile:
         return np.asarray(self.dataset.read_masks(number, window=area, out_shape=shape))
 
 
+def _read(level: DatasetReader, numbers: Sequence[int], window: Window) -> NDArray[Any]:
+    """Pixels of bands, in a type that holds those of each."""
+    if len({level.dtypes[number - 1] for number in numbers}) == 1:
+        return np.asarray(level.read(list(numbers), window=_slices(window)))
+    return np.stack([level.read(number, window=_slices(window)) for number in numbers])
+
+
 def _validity(
     raw: NDArray[Any],
     data: Float32Array,
-    nodata: Sequence[float | None],
+    differing: Sequence[BoolArray | None],
     masks: Sequence[tuple[slice | int, BoolArray]],
 ) -> BoolArray | None:
     """Everything that speaks against a pixel; None when nothing can."""
-    differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
     if raw.dtype.kind in "iu" and not masks and all(mask is None for mask in differing):
         return None
     with np.errstate(invalid="ignore"):

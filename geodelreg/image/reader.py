@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from geodelreg.door.names import LOCAL
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.access import LOCAL
 from geodelreg.image.environment import bounded_cache, gdal_calls
 from geodelreg.image.raster_file import RasterFile
 from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window

@@ -170,3 +170,11 @@ def _check_sizes(source: WindowReader, reference: WindowReader, gsd_m: FloatArra
         f"{reference.name} {texts[1]}, which cannot be compared",
         "Correct the geotransform that is wrong: gdal_edit.py -a_ullr ULX ULY LRX LRY FILE.",
     )
+
+
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """Progress of one of several equal parts."""
+    if progress is None:
+        return None
+    show = progress
+    return lambda fraction, step: show((number + fraction) / count, step)

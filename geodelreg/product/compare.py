@@ -10,6 +10,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, RasterUnreadableError
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.product.header import Provenance
@@ -52,9 +53,7 @@ def check_placement(
     OutputUnwritableError
         Its format does not hold the georeferencing.
     """
-    import rasterio
-
-    with rasterio.open(out) as dataset:
+    with open_raster(out) as dataset:
         if content.georef == "gcps":
             good = len(dataset.gcps[0]) == len(content.gcps)
         else:
@@ -92,10 +91,8 @@ def metadata_differences(
     strip_rpc : bool
         RPCs are meant to be missing.
     """
-    import rasterio
-
     names = _ATTRIBUTES | (_ENCODING if same_encoding else {})
-    with rasterio.open(source) as before, rasterio.open(out) as after:
+    with open_raster(source) as before, open_raster(out) as after:
         found = [
             text
             for name, text in names.items()
@@ -126,9 +123,7 @@ def check_pixels(source: Path, out: Path, target: Path, overviews: bool) -> None
     RasterUnreadableError
         The source cannot be decoded.
     """
-    import rasterio
-
-    with rasterio.open(source) as before, rasterio.open(out) as after:
+    with open_raster(source) as before, open_raster(out) as after:
         if (before.dtypes, before.shape) != (after.dtypes, after.shape):
             raise _lossy(target, f"bands of {after.dtypes[0]} instead of {before.dtypes[0]}")
         _check_values(before, after, target)
@@ -137,8 +132,8 @@ def check_pixels(source: Path, out: Path, target: Path, overviews: bool) -> None
             levels = []
     for level in range(len(levels)):
         with (
-            rasterio.open(source, OVERVIEW_LEVEL=level) as before,
-            rasterio.open(out, OVERVIEW_LEVEL=level) as after,
+            open_raster(source, OVERVIEW_LEVEL=level) as before,
+            open_raster(out, OVERVIEW_LEVEL=level) as after,
         ):
             _check_values(before, after, target)
 
@@ -150,9 +145,7 @@ def check_decodable(source: Path) -> None:
     ------
     RasterUnreadableError
     """
-    import rasterio
-
-    with rasterio.open(source) as dataset:
+    with open_raster(source) as dataset:
         for window in windows_of(dataset):
             _read(dataset, window, "pixels", RasterUnreadableError, source)
 

@@ -26,7 +26,10 @@ _RASTER_TYPE_KEY, _PIXEL_IS_POINT = 1025, 2
 DOMAIN = "GEODELREG"
 """Metadata domain of the GCPs; also the prefix of the provenance tags."""
 
-_ITEM = re.compile(rb"[ \t]*<Item\b([^>]*?)(?:/>|>.*?</Item>)[ \t]*\r?\n?", re.DOTALL)
+_ITEM = re.compile(
+    rb"[ \t]*<Item\b([^>]*?)(?:/>|>(?:<!\[CDATA\[.*?\]\]>|(?!<!\[CDATA\[).)*?</Item>)[ \t]*\r?\n?",
+    re.DOTALL,
+)
 
 
 def gcps_json(gcps: Sequence[Gcp]) -> str:

@@ -10,8 +10,9 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from geodelreg.door.names import is_local
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import RasterUnreadableError, UsageError
-from geodelreg.fatal import check_survivable
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.atomic import staged
@@ -94,13 +95,10 @@ def check_source(source: Path) -> None:
     ------
     RasterNotFoundError, RasterUnreadableError
     """
-    import rasterio
-
-    if not str(source).startswith("/vsi"):
+    if is_local(str(source)):
         open_source(source).close()
-        check_survivable(source)
     try:
-        rasterio.open(source).close()
+        open_raster(source).close()
     except gdal_failures() as error:
         raise RasterUnreadableError(
             f"{source} is not a raster that GDAL reads: {error}", "Check the file."
@@ -116,11 +114,10 @@ def _is_copied(source: Path, target: Path, options: WriteOptions) -> bool:
 
 
 def _losses(source: Path, out: Path, content: Provenance, copied: bool) -> list[str]:
-    import rasterio
 
     lost = compare.metadata_differences(source, out, copied, content.strip_rpc)
     notes = [f"{source.name}: not kept in the output: {what}" for what in lost]
-    with rasterio.open(out) as dataset:
+    with open_raster(out) as dataset:
         has_rpc = "RPC" in metadata.domains(dataset)
     if has_rpc:
         notes.append(

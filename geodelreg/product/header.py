@@ -11,6 +11,7 @@ from typing import Any
 
 from affine import Affine
 
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.product import geotags
 from geodelreg.product.environment import gdal_failures
@@ -88,10 +89,10 @@ class Georeference:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             ignores = str(get_gdal_config("GTIFF_POINT_GEO_IGNORE")).upper() in _TRUE
             try:
-                with rasterio.open(path, GEOREF_SOURCES="INTERNAL") as inside:
+                with open_raster(path, GEOREF_SOURCES="INTERNAL") as inside:
                     transform = inside.transform if _is_placed(inside) else None
                     crs = inside.crs
-                with rasterio.open(path) as whole:
+                with open_raster(path) as whole:
                     return cls(transform, crs, whole.crs, ignores)
             except gdal_failures() as error:
                 raise RasterUnreadableError(

@@ -15,6 +15,7 @@ from html import escape
 from pathlib import Path
 from typing import BinaryIO
 
+from geodelreg.door.opening import open_raster, own_name
 from geodelreg.errors import (
     OutputUnwritableError,
     RasterNotFoundError,
@@ -240,12 +241,14 @@ def _preview(raster: Path, edit: Edit, header_bytes: int) -> Iterator[str]:
                 "</SubfileRegion>"
             )
         xml += "</VSISparseFile>"
-        with MemoryFile(os.fsencode(xml), ext=".xml") as description:
-            yield f"/vsisparse/{description.name}"
+        with (
+            MemoryFile(os.fsencode(xml), ext=".xml") as description,
+            own_name(f"/vsisparse/{description.name}", "GTiff") as preview,
+        ):
+            yield preview
 
 
 def _has_rpc(raster: Path) -> bool:
-    import rasterio
 
-    with rasterio.open(raster) as dataset:
+    with open_raster(raster) as dataset:
         return "RPC" in metadata.domains(dataset)

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from geodelreg.door.opening import open_raster
 from geodelreg.product.geotags import DOMAIN
 
 logger = logging.getLogger(__name__)
@@ -67,9 +68,7 @@ def lost_metadata(
     list of dict
         Items by domain ("" the default one): of the raster first, then of each band.
     """
-    import rasterio
-
-    with rasterio.open(source) as before, rasterio.open(out) as after:
+    with open_raster(source) as before, open_raster(out) as after:
         levels = (0, *(band for band in before.indexes if band <= after.count))
         return [_lost_items(before, after, level, ignored) for level in levels]
 

@@ -10,6 +10,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from geodelreg.door.formats import FORMATS, needed_for
+from geodelreg.door.names import LOCAL, refuse
+from geodelreg.door.opening import allowed, open_raster
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
@@ -38,6 +41,8 @@ def output_driver(target: Path, driver: str | None) -> str:
     ------
     UsageError
         It is unknown.
+    AccessNotAllowedError
+        Files of that format can name others.
     """
     import rasterio
     from rasterio.drivers import raster_driver_extensions
@@ -50,12 +55,24 @@ def output_driver(target: Path, driver: str | None) -> str:
                 f"{target}: no format is known for the extension .{extension}",
                 "Name the format, e.g. --of GTiff.",
             )
-        return by_extension[extension]
+        return _openable(target, by_extension[extension])
     with rasterio.Env() as env:
-        known: dict[str, str] = {name.upper(): name for name in env.drivers()}
-    if driver.upper() not in known:
+        there: set[str] = set(env.drivers())
+    # of those that need more than is allowed, the command has left GDAL none
+    wanted = {name.upper(): name for name in {*FORMATS, *there}}.get(driver.upper())
+    if wanted is not None:
+        _openable(target, wanted)
+    if wanted not in there:
         raise UsageError(f"GDAL has no format {driver!r} here", "See gdalinfo --formats.")
-    return known[driver.upper()]
+    return wanted
+
+
+def _openable(target: Path, driver: str) -> str:
+    """The driver, if what it writes may be opened again to be compared."""
+    needed = needed_for(driver)
+    if needed not in (LOCAL, allowed()):
+        raise refuse(f"{target}: files of the format {driver} can open others", needed)
+    return driver
 
 
 def rewrite(
@@ -107,8 +124,8 @@ def _create_copy(
     import rasterio.shutil
 
     logger.debug("%s: %s %s", target, driver, dict(creation))
-    with gdal_write(source, target, driver):
-        rasterio.shutil.copy(name, out, driver=driver, strict=False, **creation)
+    with gdal_write(source, target, driver), open_raster(name) as dataset:
+        rasterio.shutil.copy(dataset, out, driver=driver, strict=False, **creation)
 
 
 @contextmanager
@@ -142,11 +159,9 @@ def _tiff_creation(
     source: Path, driver: str, options: WriteOptions, notes: list[str]
 ) -> dict[str, str]:
     """Creation options: the user's, and for the rest the source's own encoding if it is a TIFF."""
-    import rasterio
-
     user = user_creation(options)
     creation = {"BIGTIFF": "IF_SAFER"}
-    with rasterio.open(source) as dataset:
+    with open_raster(source) as dataset:
         names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
         structure = metadata.tags(dataset, 0, "IMAGE_STRUCTURE")
         has_overviews = bool(dataset.overviews(1))
@@ -207,9 +222,7 @@ def _clean_pam(out: Path, content: Provenance) -> None:
 
 def _complete_metadata(source: Path, out: Path, content: Provenance) -> None:
     """Put what the format has no place for into a PAM file."""
-    import rasterio
-
-    with rasterio.open(out) as dataset:
+    with open_raster(out) as dataset:
         unsaid = {
             domain: items
             for domain, items in content.domains.items()

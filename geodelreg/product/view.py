@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 from affine import Affine
 
+from geodelreg.door.opening import open_raster, own_name
 from geodelreg.product import metadata, sidecars
 from geodelreg.product.header import Provenance
 
@@ -30,11 +31,10 @@ def corrected_view(
     mask_rules : bool
         Leave out no-data values where the raster has a mask as well, which then rules.
     """
-    import rasterio
     import rasterio.shutil
     from rasterio.io import MemoryFile
 
-    with MemoryFile(ext=".vrt") as plain, rasterio.open(source) as dataset:
+    with MemoryFile(ext=".vrt") as plain, open_raster(source) as dataset:
         rasterio.shutil.copy(dataset, plain.name, driver="VRT")
         root = ElementTree.fromstring(_text(plain.read()))
         sidecars.add_metadata(root, _further_domains(dataset, 0))
@@ -49,8 +49,11 @@ def corrected_view(
             for element in band.findall("NoDataValue"):
                 band.remove(element)
     text: str = ElementTree.tostring(root, encoding="unicode")
-    with MemoryFile(text.encode(), ext=".vrt") as corrected:
-        yield corrected.name, text
+    with (
+        MemoryFile(text.encode(), ext=".vrt") as corrected,
+        own_name(corrected.name, "VRT") as name,
+    ):
+        yield name, text
 
 
 def _text(xml: bytes) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.masking import flag_bands
@@ -169,12 +170,11 @@ def _pixel_size(transform: Affine) -> tuple[float, float]:
 def _target_grid(
     source: Path, correction: Correction, reference: Grid, options: WriteOptions
 ) -> Grid:
-    import rasterio
 
     if options.warp_grid == "pan":
         grid = reference
     else:
-        with rasterio.open(source) as dataset:
+        with open_raster(source) as dataset:
             shape = dataset.shape
         try:
             grid = north_up_grid(correction, shape)
@@ -198,7 +198,7 @@ def _warp(
     import rasterio
 
     notes: list[str] = []
-    with corrected_view(source, content, mask_rules=True) as (name, _), rasterio.open(name) as view:
+    with corrected_view(source, content, mask_rules=True) as (name, _), open_raster(name) as view:
         resampling, flags = _resampling(source, view, options, notes)
         validity = _Validity.of(view)
         if len({repr(value) for value in view.nodatavals}) > 1:
@@ -334,7 +334,7 @@ def _copy_overviews(source: Path, out: Path, resampling: str) -> None:
     import rasterio
     from rasterio.enums import Resampling
 
-    with rasterio.open(source) as dataset:
+    with open_raster(source) as dataset:
         factors = dataset.overviews(1)
     if factors:
         with rasterio.open(out, "r+") as dataset:

@@ -4,81 +4,19 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import zipfile
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import rasterio
 
+from geodelreg.door.names import LOCAL, NETWORK, needed_access
 from geodelreg.errors import AccessNotAllowedError, RasterUnreadableError
-from geodelreg.image.access import LOCAL, NETWORK, needed_access
 from geodelreg.image.reader import open_raster
 from geodelreg.types import Window
 from tests.cli.helpers import COMMAND
+from tests.integration.loopback import Server
 from tests.integration.raster_samples import make_tiff
-
-# serves /short.tif: the beginning of a file, then the connection is cut
-SERVER = """
-import http.server, sys
-class Handler(http.server.BaseHTTPRequestHandler):
-    def do_GET(self):
-        with open(sys.argv[1], "a") as log:
-            log.write(self.path + "\\n")
-        data = open(sys.argv[2], "rb").read()
-        if self.path == "/short.tif" and self.headers.get("Range"):
-            start, _, end = self.headers["Range"].partition("=")[2].partition("-")
-            start, end = int(start), min(int(end), len(data) - 1)
-            if start > 0:
-                return
-            self.send_response(206)
-            self.send_header("Content-Range", f"bytes {start}-{end}/{len(data)}")
-            self.send_header("Content-Length", str(end + 1 - start))
-            self.end_headers()
-            self.wfile.write(data[start:end + 1])
-        elif self.path == "/short.tif":
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(data)))
-            self.send_header("Accept-Ranges", "bytes")
-            self.end_headers()
-            if self.command == "GET":
-                self.wfile.write(data[:20_000])
-        else:
-            self.send_response(404)
-            self.end_headers()
-    do_HEAD = do_GET
-    def log_message(self, *args):
-        pass
-server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-print(server.server_port, flush=True)
-server.serve_forever()
-"""
-
-
-@dataclass
-class Server:
-    """An HTTP server in a process of its own: GDAL may hold the lock of this one."""
-
-    address: str
-    log: Path
-
-    @property
-    def requests(self) -> list[str]:
-        return self.log.read_text().split() if self.log.exists() else []
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    served = make_tiff(tmp_path / "served.tif", "striped", shape=(400, 400))
-    log = tmp_path / "requests.txt"
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVER, str(log), str(served)], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        yield Server(f"http://127.0.0.1:{int(process.stdout.readline())}", log)
-        process.kill()
 
 
 def read_some(name: Path | str, allow: str = LOCAL) -> None:
@@ -196,7 +134,7 @@ def test_files_that_describe_web_services_are_not_opened(tmp_path: Path, server:
     service = tmp_path / "wms.xml"
     service.write_text(SERVICE.format(url=server.address))
     for path in (service, vrt(tmp_path, SOURCE.format(service))):
-        with pytest.raises(RasterUnreadableError, match=r"wms\.xml"):
+        with pytest.raises(AccessNotAllowedError, match=r"wms\.xml is a file of the format WMS"):
             read_some(path)
     assert server.requests == []
 
@@ -297,3 +235,17 @@ def test_the_command_sends_no_request_and_says_what_allows_it(
         if "://" in name:
             assert "add --allow network" in result.stderr
     assert server.requests == []
+
+
+def test_a_source_on_the_network_is_looked_at_before_it_is_opened(
+    tmp_path: Path, server: Server
+) -> None:
+    for name, served in (("/whole.tif", True), ("/x.mrf", False)):
+        path = vrt(tmp_path, SOURCE.format(f"/vsicurl/{server.address}{name}"))
+        if served:
+            read_some(path, NETWORK)
+        else:
+            with pytest.raises(RasterUnreadableError, match=r"x\.mrf, a source of"):
+                read_some(path, NETWORK)
+            assert "/x.mrf" in server.requests
+            assert not (tmp_path / "victim").exists()

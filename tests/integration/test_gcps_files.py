@@ -20,7 +20,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.rio.main import main_group
 from rasterio.transform import from_gcps
 
-from geodelreg.errors import GcpFormatError, RasterUnreadableError
+from geodelreg.errors import GcpFormatError, RasterNotFoundError
 from geodelreg.product.gcps import GCP_FORMATS, GcpContext, read_gcps, write_gcps
 from geodelreg.types import Gcp, Grid
 from tests.data.gcps import make
@@ -153,7 +153,7 @@ def test_vrt_refuses_files_on_other_grids(folder: Path) -> None:
     with pytest.raises(GcpFormatError, match="needs the raster it shows"):
         write_gcps(folder / "other.vrt", make.points(), context=replace(context, source_paths=()))
     missing = replace(context, source_paths=(str(folder / "none.tif"),))
-    with pytest.raises(RasterUnreadableError, match=r"none\.tif cannot be read"):
+    with pytest.raises(RasterNotFoundError, match=r"none\.tif does not exist"):
         write_gcps(folder / "other.vrt", make.points(), context=missing)
     assert not (folder / "other.vrt").exists()
 

@@ -13,8 +13,8 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 
 from geodelreg.errors import (
+    AccessNotAllowedError,
     LossyOutputError,
-    OutputUnwritableError,
     RasterUnreadableError,
     UsageError,
 )
@@ -224,7 +224,9 @@ def test_unknown_formats_are_wrong_usage(tmp_path: Path) -> None:
         write(source, tmp_path / "out.xyzzy")
     with pytest.raises(UsageError, match="Nonsense"):
         write(source, tmp_path / "out.tif", driver="Nonsense")
-    with pytest.raises(OutputUnwritableError, match=r"out\.tif.*WMTS"):
+    with pytest.raises(AccessNotAllowedError, match=r"out\.tif.*MRF can open others.*all"):
+        write(source, tmp_path / "out.tif", driver="mrf")
+    with pytest.raises(AccessNotAllowedError, match=r"out\.tif.*WMTS.*network"):
         write(source, tmp_path / "out.tif", driver="WMTS")
     assert names(tmp_path) == {"ms.tif"}
 

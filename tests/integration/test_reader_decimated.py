@@ -244,3 +244,27 @@ def test_pieces_cut_no_block(write_raster: WriteRaster, bands: int, side: int) -
         assert piece.row % side == 0
         assert (piece.column + piece.width) % side == 0 or piece.column + piece.width == 1300
         assert (piece.row + piece.height) % side == 0 or piece.row + piece.height == 1100
+
+
+@pytest.mark.parametrize("nodata", [None, 0])
+def test_empty_blocks_of_a_sparse_raster_count_as_what_they_are(
+    tmp_path: Path, nodata: int | None
+) -> None:
+    values = np.zeros((2, 3000, 3000), dtype=np.uint16)
+    values[:, 1400:1700, 500:1900] = np.random.default_rng(1).integers(1, 4000, (2, 300, 1400))
+    path = tmp_path / "sparse.tif"
+    profile = {"driver": "GTiff", "dtype": "uint16", "count": 2, "height": 3000, "width": 3000}
+    profile |= {"tiled": True, "sparse_ok": True, "crs": "EPSG:32616", "nodata": nodata}
+    transform = Affine(2, 0, 500_000, 0, -2, 4_000_000)
+    with rasterio.open(path, "w", transform=transform, **profile) as dataset:
+        rows, columns = slice(1280, 1792), slice(256, 2048)
+        dataset.write(values[:, rows, columns], window=((1280, 1792), (256, 2048)))
+    cells = values.reshape(2, 300, 10, 300, 10).astype(float)
+    there = np.ones_like(cells) if nodata is None else (cells != nodata).astype(float)
+    count = there.sum(axis=(2, 4))
+    expected = cells.sum(axis=(2, 4)) / np.maximum(count, 1)
+    with open_raster(path) as reader:
+        bands = reader.read([1, 2], Window(0, 0, 3000, 3000), (300, 300))
+    for band, mean, number in zip(bands, expected, count, strict=True):
+        assert np.array_equal(band.valid, number >= 50)
+        assert np.allclose(band.data[band.valid], mean[band.valid], rtol=1e-6)

@@ -15,8 +15,8 @@ from rasterio.control import GroundControlPoint
 from rasterio.rpc import RPC
 
 from geodelreg import errors
+from geodelreg.door.names import ALL
 from geodelreg.errors import GeodelregError
-from geodelreg.image.access import ALL
 from geodelreg.image.reader import open_raster
 from geodelreg.types import Window
 from tests.conftest import WriteRaster

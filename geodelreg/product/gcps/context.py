@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,11 @@ from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.types import Alignment, FloatArray, Gcp, Grid, IntArray, TiePoints
+
+_CRS_TEXT = re.compile(
+    r"[A-Za-z]\w*:[\w.]+$|[A-Z]\w+\s*[\[(]|\+|\{|urn:|https?://(www\.)?opengis\.net/def/crs/|"
+    r"(WGS84|WGS72|NAD27|NAD83)$"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +162,12 @@ def crs_wkt_of(name: str) -> str:
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
+    if not _CRS_TEXT.match(name.strip()):  # GDAL would fetch addresses, and open files
+        raise GcpFormatError(
+            f"its CRS {name!r} is unknown: no code, WKT, PROJJSON or PROJ string, and "
+            "addresses are not fetched",
+            "Write it as EPSG:… or as WKT.",
+        )
     try:
         return str(CRS.from_string(name).to_wkt(version="WKT2_2019"))
     except (CRSError, ValueError) as error:  # rasterio lets what int() and split() say through

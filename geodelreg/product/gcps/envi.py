@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
@@ -162,8 +163,6 @@ def _envi_header(crs_wkt: str) -> str:
 
 def _crs_of_projection(info: str) -> str | None:
     """WKT of a ``projection info``; None when it does not name a datum that GDAL knows."""
-    import rasterio
-
     fields = [field.strip() for field in info.split(",")]
     units = [field for field in fields if field.lower().startswith("units")]
     fields = [field for field in fields if field not in units]
@@ -179,7 +178,7 @@ def _crs_of_projection(info: str) -> str | None:
         path = Path(folder, "tiny.img")
         path.write_bytes(b"\0\0")
         path.with_suffix(".hdr").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        with rasterio.open(path) as dataset:
+        with open_raster(path) as dataset:
             crs = dataset.crs
     known = crs is not None and (crs.is_geographic or crs.is_projected)
     return str(crs.to_wkt(version="WKT2_2019")) if known else None

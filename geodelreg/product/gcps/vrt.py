@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+from geodelreg.door.opening import open_raster
 from geodelreg.errors import GcpFormatError, RasterUnreadableError
 from geodelreg.product.gcps.context import Decoded, GcpContext, crs_wkt_of, exact, numbers, one_line
 from geodelreg.types import Gcp
@@ -66,12 +67,11 @@ def _add_gcps(root: ET.Element, gcps: Sequence[Gcp], crs_wkt: str) -> None:
 
 
 def _add_source(root: ET.Element, source: str, context: GcpContext, path: Path) -> None:
-    import rasterio
     from rasterio.errors import RasterioError
 
     several = len(context.source_paths) > 1
     try:
-        with rasterio.open(source) as dataset:
+        with open_raster(source) as dataset:
             same = dataset.transform.almost_equals(context.source.transform, 1e-9)
             if dataset.shape != context.source.shape or (several and not same):
                 raise GcpFormatError(
