@@ -78,7 +78,7 @@ def _decoded(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def _parsed(file: AnyFile, text: str) -> ElementTree.Element:
+def _parsed(file: AnyFile | str, text: str) -> ElementTree.Element:
     """Root element; GDAL is more tolerant."""
     try:
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -169,7 +169,7 @@ def in_metadata(file: AnyFile, data: bytes) -> list[Mention]:
     """Overview files that GDAL's metadata inside a TIFF name."""
     if b"overview" not in data.lower() and b"&#" not in data:
         return []
-    return _overview_files(_parsed(file, _decoded(data.rstrip(b"\0"))))
+    return _overview_files(_parsed(f"GDAL's metadata in {file}", _decoded(data.rstrip(b"\0"))))
 
 
 def _overview_files(root: ElementTree.Element) -> list[Mention]:
