@@ -290,12 +290,12 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.warp import write_warped
 
     options = options or WriteOptions()
-    tags = provenance_tags(alignment)
+    tags, pan = provenance_tags(alignment), Path(alignment.reference_path)
     notes: list[str] = []
     for path, out in _targets(alignment, Path(target)):
         correction, gcps = _of_file(alignment, path)
         if options.warp:
-            notes += write_warped(path, out, correction, alignment.reference, tags, options)
+            notes += write_warped(path, out, correction, alignment.reference, tags, options, pan)
         else:
             notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
