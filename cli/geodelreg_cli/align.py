@@ -136,7 +136,7 @@ def align_params() -> list[SectionOption]:
             type=FILE,
             metavar="FILE.png",
             section=OUTPUT,
-            help="Draw the tie points on both images (needs the report extra).",
+            help="Draw the tie points on both images (needs matplotlib, the report extra).",
         ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
         *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
@@ -204,6 +204,10 @@ def _check_outputs(request: Request) -> None:
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
         check_targets(inputs, targets, request.write_options.overwrite, created)
+        if request.figure is not None:
+            from geodelreg.product.figures import check_drawable
+
+            check_drawable(request.figure)
     except UsageError as error:
         raise click.UsageError(str(error)) from error
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from geodelreg.errors import shown
 from geodelreg_cli.console import configure_logging
 from geodelreg_cli.options import SectionCommand
 
@@ -28,4 +29,4 @@ def revert(files: tuple[Path, ...], quiet: bool, verbose: int, debug: bool) -> N
     for file in files:
         geodelreg.revert(file)
         if not quiet:
-            click.echo(f"{file}: original georeferencing is back", err=True)
+            click.echo(f"{shown(str(file))}: original georeferencing is back", err=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,22 +43,34 @@ _STYLE: Any = {
 }
 
 
-@contextmanager
-def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
-    """Figure that is written to `path`, whole or not at all, when the block ends."""
-    try:
-        from matplotlib import rc_context
-        from matplotlib.figure import Figure
-    except ImportError as error:
+def check_drawable(path: Path) -> None:
+    """Refuse a figure that cannot be drawn, before there is anything to draw.
+
+    Raises
+    ------
+    MissingExtraError, UsageError
+    """
+    if find_spec("matplotlib") is None:
         raise MissingExtraError(
-            "figures need matplotlib", "Install it: pip install 'geodelreg[report]'."
-        ) from error
+            f"{path.name}: figures need matplotlib",
+            "Install it: pip install matplotlib (in a clone: pip install '.[report]').",
+        )
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise UsageError(
             f"{path.name}: figures are not written as {suffix or 'files without extension'}",
             f"Use one of: {', '.join(_FORMATS)}.",
         )
+
+
+@contextmanager
+def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
+    """Figure that is written to `path`, whole or not at all, when the block ends."""
+    check_drawable(path)
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    suffix = path.suffix.lower()
     with rc_context(_STYLE):
         figure = Figure(figsize=size_in, layout="constrained")
         yield figure
