@@ -232,6 +232,8 @@ def _check_crs(path: str, dataset: DatasetReader) -> None:
         with gdal_calls():
             _ = dataset.colorinterp  # GDAL holds errors of that kind back until the next call
     except CPLE_BaseError as error:
+        if not str(error).startswith("PROJ"):
+            raise _unreadable(path, error) from error
         raise CrsTransformError(
             f"PROJ cannot use the coordinate reference system of {path}: {error}",
             "Install the grid that it names (projsync, or PROJ_DATA), or assign another CRS: "

@@ -16,6 +16,8 @@ from geodelreg.errors import OutputUnwritableError
 from geodelreg.product import sidecars
 
 _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
+_SRS = re.compile(r"<VRTDataset\b[^>]*>\s*(<SRS\b.*?</SRS>)", re.DOTALL)
+_GCP_LIST = re.compile(r"(<GCPList\b[^>]*)>")
 _WKT = re.compile(r"\s*\w+\s*\[")
 _WKT1 = re.compile(r"\s*(PROJCS|GEOGCS|GEOCCS|COMPD_CS|VERT_CS|LOCAL_CS)\s*\[")
 
@@ -41,13 +43,16 @@ class SpatialReference:
     @classmethod
     def of(cls, dataset: Any) -> SpatialReference | None:
         """Spatial reference of an open raster, or of its GCPs; None without one."""
-        root = vrt_of(dataset)
-        element, crs = root.find("SRS"), dataset.crs
-        text = None if element is None else element.text
-        if element is None:
-            element, crs = root.find("GCPList"), dataset.gcps[1]
-            text = None if element is None else element.get("Projection")
-        if element is None or not text or not crs:
+        xml = _vrt_text(dataset)
+        if found := _SRS.search(xml):
+            element, crs = ElementTree.fromstring(found[1]), dataset.crs
+            text = element.text
+        elif found := _GCP_LIST.search(xml):
+            element, crs = ElementTree.fromstring(found[1] + "/>"), dataset.gcps[1]
+            text = element.get("Projection")
+        else:
+            return None
+        if not text or not crs:
             return None
         mapping = element.get("dataAxisToSRSAxisMapping", "")
         return cls(_whole_wkt(dataset, crs, text), mapping, element.get("coordinateEpoch", ""))
@@ -129,6 +134,10 @@ def keep(wanted: SpatialReference | None, out: Path, target: Path) -> list[str]:
 
 def vrt_of(dataset: Any) -> ElementTree.Element:
     """What GDAL knows of an open raster, as the XML of a VRT."""
+    return ElementTree.fromstring(_vrt_text(dataset))
+
+
+def _vrt_text(dataset: Any) -> str:
     import rasterio.shutil
     from rasterio.io import MemoryFile
 
@@ -139,7 +148,7 @@ def vrt_of(dataset: Any) -> ElementTree.Element:
         text = xml.decode()
     except UnicodeDecodeError:  # GDAL passes texts of old products on as they are
         text = xml.decode("latin-1")
-    return ElementTree.fromstring(_CONTROL.sub("", text))
+    return _CONTROL.sub("", text)
 
 
 def _whole_wkt(dataset: Any, crs: Any, text: str) -> str:

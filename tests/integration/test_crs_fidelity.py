@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -213,3 +213,14 @@ def test_difficult_crs_survives_or_is_refused(
     # other file says the same
     excusable = "2021" if way is by_gcps else "NTF|paris"
     assert [name for name in found if not re.search(excusable, name)] == []
+
+
+def test_warp_onto_pan_takes_its_epoch(tmp_path: Path) -> None:
+    wkt, _ = zoo()["EPSG:9057"]
+    (tmp_path / "pan").mkdir()
+    (tmp_path / "ms").mkdir()
+    pan = in_pam(tmp_path / "pan", wkt, 'coordinateEpoch="2010.5"')
+    ms = in_tiff(tmp_path / "ms", wkt, 'coordinateEpoch="2021.3"')
+    made = replace(aligned(ms), reference_path=str(pan))
+    geodelreg.write(made, tmp_path / "out.tif", WriteOptions(warp=True, warp_grid="pan"))
+    assert Said.of(tmp_path / "out.tif").attributes["coordinateEpoch"] == "2010.5"
