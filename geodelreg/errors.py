@@ -12,6 +12,15 @@ if TYPE_CHECKING:
     from geodelreg.types import Alignment
 
 
+def shown(text: str) -> str:
+    r"""One line of text with all that a terminal obeys instead of showing as escapes (``\x1b``).
+
+    Names of files, and of bands inside them, come from strangers.
+    """
+    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(escaped)
+
+
 class GeodelregError(Exception):
     """Base of all errors that geodelreg raises on purpose.
 
@@ -26,10 +35,8 @@ class GeodelregError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, cause: str, remedy: str = "") -> None:
-        # names and texts of damaged files must not control the terminal
-        self.cause = "".join(char if char.isprintable() else "\ufffd" for char in cause)
-        self.remedy = remedy
-        super().__init__(f"{self.cause}. {remedy}" if remedy else self.cause)
+        self.cause, self.remedy = shown(cause), shown(remedy)
+        super().__init__(f"{self.cause}. {self.remedy}" if remedy else self.cause)
 
 
 class UsageError(GeodelregError, ValueError):

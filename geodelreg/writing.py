@@ -53,7 +53,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.warp import write_warped
 
     options = options or WriteOptions()
-    tags = provenance_tags(alignment)
+    tags, pan = provenance_tags(alignment), Path(alignment.reference_path)
     notes: list[str] = []
     with (
         _targets(alignment, Path(target)) as pairs,
@@ -64,7 +64,9 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
         for path, out in pairs:
             correction, gcps = _of_file(alignment, path)
             if options.warp:
-                notes += write_warped(path, out, correction, alignment.reference, tags, options)
+                notes += write_warped(
+                    path, out, correction, alignment.reference, tags, options, pan
+                )
             else:
                 notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes

@@ -140,7 +140,8 @@ def align_params() -> list[SectionOption]:
             type=FILE,
             metavar="FILE.png",
             section=OUTPUT,
-            help="Draw the tie points on both images (needs the report extra); - writes to stdout.",
+            help="Draw the tie points on both images (needs matplotlib, the report extra); - is "
+            "stdout.",
         ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
         *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
@@ -222,6 +223,10 @@ def _check_outputs(request: Request) -> list[Path]:
             request.output if len(request.sources) > 1 else None,
             rasters,
         )
+        if request.figure is not None:
+            from geodelreg.product.figures import check_drawable
+
+            check_drawable(request.figure)
     except UsageError as error:
         raise click.UsageError(str(error)) from error
     if not written:

@@ -7,8 +7,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import click
+
+from geodelreg.errors import shown
 
 Progress = Callable[[float, str], None]
 
@@ -19,6 +22,18 @@ class _Stderr(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Write one record."""
         click.echo(self.format(record), err=True)
+
+
+class _Shown(logging.Formatter):
+    """Names and texts of files in the messages cannot control the terminal."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        """One line of one record."""
+        return shown(super().formatMessage(record).strip())
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802
+        """Traceback."""
+        return "\n".join(map(shown, super().formatException(ei).split("\n")))
 
 
 def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
@@ -39,9 +54,7 @@ def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     level = logging.ERROR if quiet else max(logging.DEBUG, logging.WARNING - 10 * verbose)
     handler = _Stderr()
     handler.setFormatter(
-        logging.Formatter(
-            "%(levelname)s %(name)s: %(message)s" if debug else "geodelreg: %(message)s"
-        )
+        _Shown("%(levelname)s %(name)s: %(message)s" if debug else "geodelreg: %(message)s")
     )
     root = logging.getLogger()
     root.handlers = [handler]
@@ -82,6 +95,6 @@ def progress_bar(quiet: bool) -> Iterator[Progress | None]:
         task = bar.add_task("", total=1.0)
 
         def show(fraction: float, text: str) -> None:
-            bar.update(task, completed=fraction, description=text)
+            bar.update(task, completed=fraction, description=shown(text))
 
         yield show

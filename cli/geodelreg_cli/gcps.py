@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from geodelreg.errors import shown
 from geodelreg.options import AlignOptions
 from geodelreg_cli.console import configure_logging
 from geodelreg_cli.options import (
@@ -98,7 +99,7 @@ def gcps(
     with allowing(allow), together(inputs=lambda: [source, *input_paths(rasters, allow)]):
         write_gcps(target, points, to_format, context=context, overwrite=overwrite)
     if not quiet:
-        click.echo(f"{target}: {len(points)} points", err=True)
+        click.echo(f"{shown(str(target))}: {len(points)} points", err=True)
 
 
 def _in_crs(points: tuple[Gcp, ...], from_wkt: str, to_wkt: str) -> tuple[Gcp, ...]:

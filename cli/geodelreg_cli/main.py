@@ -13,11 +13,12 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from io import StringIO
 
 import click
 
 from geodelreg import __version__
-from geodelreg.errors import AlignmentRefusedError, GeodelregError
+from geodelreg.errors import AlignmentRefusedError, GeodelregError, shown
 from geodelreg_cli.interrupts import Terminated, termination_as_exception
 
 # name: (module that holds the click command of that name, line in the list of commands)
@@ -94,7 +95,9 @@ def run(args: Sequence[str]) -> int:
             code = cli.main(list(args), prog_name="geodelreg", standalone_mode=False)
             return code if isinstance(code, int) else 0
     except click.ClickException as error:
-        error.show()
+        text = StringIO()
+        error.show(text)
+        _echo_lines(text.getvalue())
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -106,7 +109,7 @@ def run(args: Sequence[str]) -> int:
         if "--debug" in args:
             import traceback
 
-            traceback.print_exc()
+            _echo_lines(traceback.format_exc())
         return _explain(error)
 
 
@@ -127,8 +130,13 @@ def _explain(error: Exception) -> int:
     return 1
 
 
+def _echo_lines(text: str) -> None:
+    for line in text.rstrip("\n").split("\n"):
+        click.echo(shown(line), err=True)
+
+
 def _say(text: str) -> None:
-    click.echo(f"geodelreg: {text}", err=True)
+    click.echo(f"geodelreg: {shown(text)}", err=True)
 
 
 def main() -> None:

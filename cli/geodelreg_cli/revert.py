@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from geodelreg.errors import shown
 from geodelreg_cli.console import configure_logging
 from geodelreg_cli.options import SectionCommand
 
@@ -29,4 +30,4 @@ def revert(files: tuple[Path, ...], quiet: bool, verbose: int, debug: bool) -> N
     geodelreg.revert(*files)
     if not quiet:
         for file in files:
-            click.echo(f"{file}: original georeferencing is back", err=True)
+            click.echo(f"{shown(str(file))}: original georeferencing is back", err=True)

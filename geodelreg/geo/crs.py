@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,8 +63,10 @@ def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOpera
             group = TransformerGroup(source, target, always_xy=True)
         transformer = group.transformers[0]
     except (ProjError, IndexError) as error:
+        reason = f" ({error})" if isinstance(error, ProjError) else ""
         raise CrsTransformError(
-            f"no transformation between the coordinate reference systems is known ({error})",
+            "no transformation between the coordinate reference systems "
+            f"{_name(from_wkt)} and {_name(to_wkt)} is known{reason}",
             "Reproject one raster into the other's CRS, or correct its CRS definition.",
         ) from error
     accuracy = float(transformer.accuracy)
@@ -80,6 +83,11 @@ def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOpera
     if accuracy == accuracy:
         text = f"{text} (accuracy {accuracy:g} m)"
     return transformer, CrsOperation(text, accuracy, warning)
+
+
+def _name(wkt: str) -> str:
+    found = re.search(r'"([^"]*)"', wkt)
+    return repr(found[1]) if found else "without a name"
 
 
 def crs_operation(from_wkt: str, to_wkt: str) -> CrsOperation:

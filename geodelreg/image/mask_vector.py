@@ -167,7 +167,8 @@ def _read_with_pyogrio(path: str, allow: str) -> tuple[Geometries, str]:
     except ImportError as error:
         raise MissingExtraError(
             f"the mask {path} needs pyogrio to be read",
-            "pip install 'geodelreg[vector]', or convert it to GeoJSON.",
+            "Install it: pip install pyogrio (in a clone: pip install '.[vector]'); or convert the "
+            "mask to GeoJSON.",
         ) from error
     from shapely import from_wkb
 

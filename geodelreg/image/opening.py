@@ -14,6 +14,7 @@ from affine import Affine
 from geodelreg.door.names import LOCAL, check_name, gdal_name, is_local
 from geodelreg.door.opening import look_at, open_entry
 from geodelreg.errors import (
+    CrsTransformError,
     MissingCrsError,
     MissingGeoreferenceError,
     RasterNotFoundError,
@@ -134,7 +135,7 @@ def dataset_grid(path: str, dataset: DatasetReader) -> Grid:
 
     Raises
     ------
-    MissingGeoreferenceError, UnsupportedGeoreferenceError, MissingCrsError
+    MissingGeoreferenceError, UnsupportedGeoreferenceError, MissingCrsError, CrsTransformError
     """
     with gdal_calls(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -153,7 +154,9 @@ def dataset_grid(path: str, dataset: DatasetReader) -> Grid:
             f"{path} has no coordinate reference system",
             "Assign the right one: gdal_edit.py -a_srs EPSG:… FILE (or rio edit-info --crs).",
         )
-    return Grid(transform, (dataset.height, dataset.width), _wkt2(crs), _unit_m(crs))
+    wkt, unit = _wkt2(crs), _unit_m(crs)
+    _check_crs(path, dataset)
+    return Grid(transform, (dataset.height, dataset.width), wkt, unit)
 
 
 def _check_transform(path: str, transform: Affine, has_gcps: bool, has_rpcs: bool) -> None:
@@ -208,6 +211,23 @@ def _unit_m(crs: CRS) -> float | None:
             return float(crs.linear_units_factor[1]) if crs.is_projected else None
         except CRSError:
             return None
+
+
+def _check_crs(path: str, dataset: DatasetReader) -> None:
+    """Refuse a CRS that PROJ failed on, for want of a grid for instance, when it was looked at."""
+    from rasterio._err import CPLE_BaseError
+
+    try:
+        with gdal_calls():
+            _ = dataset.colorinterp  # GDAL holds errors of that kind back until the next call
+    except CPLE_BaseError as error:
+        if not str(error).startswith("PROJ"):
+            raise _unreadable(path, error) from error
+        raise CrsTransformError(
+            f"PROJ cannot use the coordinate reference system of {path}: {error}",
+            "Install the grid that it names (projsync, or PROJ_DATA), or assign another CRS: "
+            "gdal_edit.py -a_srs EPSG:… FILE.",
+        ) from error
 
 
 def _wkt2(crs: object) -> str:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import accuracy_line, json_text, masks_line, plain, report_dict, short
 from geodelreg.types import Alignment, CheckOutcome, Misalignment
@@ -162,7 +163,7 @@ def check_text(check: Check) -> str:
         lines.append(masks_line(check.alignment))
     if check.bands is not None:
         lines += ["", *_band_lines(check.bands)]
-    return "\n".join(lines)
+    return "\n".join(map(shown, lines))
 
 
 def _verdict_line(check: Check) -> str:

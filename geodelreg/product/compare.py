@@ -124,6 +124,8 @@ def check_pixels(source: Path, out: Path, target: Path, overviews: bool) -> None
         The source cannot be decoded.
     """
     with open_raster(source) as before, open_raster(out) as after:
+        if not after.count:
+            raise _lossy(target, f"{after.driver} makes each band a raster of its own")
         if (before.dtypes, before.shape) != (after.dtypes, after.shape):
             raise _lossy(target, f"bands of {after.dtypes[0]} instead of {before.dtypes[0]}")
         _check_values(before, after, target)

@@ -20,6 +20,7 @@ from geodelreg.product.copying import open_source
 from geodelreg.product.environment import gdal_failures, gdal_session
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import output_driver, rewrite
+from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
 from geodelreg.product.tiffwrite import copy_with_header, is_cog
 from geodelreg.tiff import is_tiff
@@ -74,6 +75,7 @@ def write_corrected(
     check_not_input(target, [source])
     with gdal_session(source):
         check_source(source)
+        reference = spatial_reference(source)
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), source)
         with staged(target, overwrite=options.overwrite, stale=stale) as out:
             if _is_copied(source, target, options):
@@ -83,6 +85,7 @@ def write_corrected(
             else:
                 notes = rewrite(source, out, target, content, options)
                 tolerance_px, copied = _REWRITTEN_PX, False
+            notes += keep(reference, out, target)
             compare.check_placement(out, target, content, tolerance_px)
             notes += _losses(source, out, content, copied)
     return notes

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from affine import Affine
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import RasterUnreadableError
-from geodelreg.product import geotags
+from geodelreg.product import geotags, sidecars
 from geodelreg.product.environment import gdal_failures
+from geodelreg.product.srs import SpatialReference, spatial_reference
 from geodelreg.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
 from geodelreg.types import Correction, Gcp
 
@@ -63,14 +65,14 @@ class Georeference:
     ----------
     transform : Affine or None
         Inside; None when there is none.
-    crs, crs_with_sidecars : rasterio CRS or None
+    reference, reference_with_sidecars : SpatialReference or None
     ignores_point : bool
         GDAL is configured not to tell pixel centres from corners.
     """
 
     transform: Affine | None
-    crs: Any
-    crs_with_sidecars: Any
+    reference: SpatialReference | None
+    reference_with_sidecars: SpatialReference | None
     ignores_point: bool = False
 
     @classmethod
@@ -91,9 +93,8 @@ class Georeference:
             try:
                 with open_raster(path, GEOREF_SOURCES="INTERNAL") as inside:
                     transform = inside.transform if _is_placed(inside) else None
-                    crs = inside.crs
-                with open_raster(path) as whole:
-                    return cls(transform, crs, whole.crs, ignores)
+                    reference = SpatialReference.of(inside)
+                return cls(transform, reference, spatial_reference(path), ignores)
             except gdal_failures() as error:
                 raise RasterUnreadableError(
                     f"{path} cannot be read by GDAL: {error}", "Obtain the file again."
@@ -144,19 +145,40 @@ def merged_domains(first: Domains, second: Domains) -> dict[str, dict[str, str]]
 
 
 def _crs_entries(layout: Layout, georeference: Georeference, is_point: bool) -> list[Entry]:
-    """GeoKeys as GDAL writes them, when those of the file lack or contradict what GDAL reads."""
-    crs = georeference.crs_with_sidecars
-    if crs is None or crs == georeference.crs:
-        return []
-    from rasterio.io import MemoryFile
+    """GeoKeys as GDAL writes them, when those of the file lack or contradict what GDAL reads.
 
-    with MemoryFile(ext=".tif") as memory:
-        profile = {"driver": "GTiff", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
-        with memory.open(**profile, crs=crs, transform=Affine(1, 0, 1, 0, -1, 1)) as dataset:
-            dataset.update_tags(AREA_OR_POINT="Point" if is_point else "Area")
-        template = TiffFile(Path(memory.name), BytesIO(memory.read()))
+    None when they would say something else: not all CRSs fit in.
+    """
+    wanted = georeference.reference_with_sidecars
+    if wanted is None or wanted.is_same(georeference.reference):
+        return []
+    template = _template(wanted, is_point)
+    if template is None:
+        return []
     entries = [template.first_directory().find(tag) for tag in geotags.CRS_TAGS]
     return [_transcribed(template, entry, layout) for entry in entries if entry is not None]
+
+
+def _template(reference: SpatialReference, is_point: bool) -> TiffFile | None:
+    """TIFF that GDAL has written with this spatial reference; None when it does not read so."""
+    import rasterio
+    import rasterio.shutil
+    from rasterio.io import MemoryFile
+
+    root = ElementTree.Element("VRTDataset", {"rasterXSize": "1", "rasterYSize": "1"})
+    root.append(reference.element())
+    ElementTree.SubElement(root, "GeoTransform").text = "1, 1, 0, 1, 0, -1"
+    sidecars.add_metadata(root, {"": {"AREA_OR_POINT": "Point" if is_point else "Area"}})
+    ElementTree.SubElement(root, "VRTRasterBand", {"dataType": "Byte", "band": "1"})
+    with (
+        rasterio.Env(GDAL_PAM_ENABLED=False),
+        MemoryFile(ElementTree.tostring(root), ext=".vrt") as virtual,
+        MemoryFile(ext=".tif") as memory,
+    ):
+        rasterio.shutil.copy(virtual.name, memory.name, driver="GTiff")
+        if not reference.is_same(spatial_reference(memory.name)):
+            return None
+        return TiffFile(Path(memory.name), BytesIO(memory.read()))
 
 
 def _transcribed(template: TiffFile, entry: Entry, layout: Layout) -> Entry:

@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import BinaryIO
@@ -27,6 +28,7 @@ from geodelreg.product.durable import unwritable
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Georeference, Provenance, corrected_entries
+from geodelreg.product.srs import SpatialReference, is_kept_in_pam, spatial_reference
 from geodelreg.product.tiffwrite import appended_directory, fits, new_pointer
 from geodelreg.product.undo import Edit, SidecarChange, State
 from geodelreg.tiff import TiffFile, is_tiff
@@ -73,13 +75,14 @@ def edit_in_place(
     raster = Path(os.path.realpath(path))
     check_editable(path)
     with together([raster]) as run, gdal_session(path), _opened(path, raster) as file:
-        edits = _recovered(raster, file, run.lock(raster).scratch)
+        scratch = run.lock(raster).scratch
+        edits = _recovered(raster, file, scratch)
         check_source(raster)
         notes = []
         if edits and edits[-1].state(raster, file) is State.FOREIGN:
             notes.append(f"{path}: changed by another program since; earlier edits stay for good")
             edits = []
-        edit = _planned(path, raster, file, content)
+        edit = _planned(path, raster, file, content, scratch)
         if _has_rpc(raster):
             notes.append(f"{path}: its RPCs do not know the correction; write to OUT to drop them")
         run.add_edit(raster, [*edits, edit])
@@ -170,7 +173,7 @@ def _recovered(raster: Path, file: BinaryIO, scratch: Path) -> list[Edit]:
     return edits
 
 
-def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance) -> Edit:
+def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance, scratch: Path) -> Edit:
     tiff = TiffFile(raster, file)
     structure = relayout.Structure.read(tiff)
     relayout.check_complete(tiff, structure)
@@ -190,28 +193,40 @@ def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance) -> E
         tiff.layout.offset(tiff.first_offset),
         new_pointer(tiff),
         appended_directory(tiff, entries),
-        _sidecar_changes(path, raster, content),
     )
+    reference = georeference.reference_with_sidecars
     with _preview(raster, edit, tiff.layout.header_bytes) as name:
         compare.check_placement(name, path, content, _EXACT_PX)
-    return edit
+        if reference is not None and reference.is_same(spatial_reference(name)):
+            reference = None
+    if reference is not None and not is_kept_in_pam(reference, scratch):
+        raise UnsafeInPlaceError(
+            f"{path} would lose its coordinate reference system {reference.name}", _TO_OUT
+        )
+    return replace(edit, sidecars=_sidecar_changes(path, raster, content, reference))
 
 
-def _sidecar_changes(path: Path, raster: Path, content: Provenance) -> tuple[SidecarChange, ...]:
-    """Side files that would contradict the new header: PAM overrides it, world files go stale."""
+def _sidecar_changes(
+    path: Path, raster: Path, content: Provenance, reference: SpatialReference | None
+) -> tuple[SidecarChange, ...]:
+    """Side files that would contradict the new header: PAM overrides it, world files go stale.
+
+    PAM keeps the spatial reference that has no place inside, if any.
+    """
     changes = []
     pam = sidecars.pam_path(raster)
-    if pam.is_file():
-        before = pam.read_bytes()
-        try:
-            after = sidecars.without_placement(before)
-        except ValueError as error:
-            raise UnsafeInPlaceError(
-                f"{pam} may override the header of {path.name}, and is no PAM file ({error})",
-                "Remove or repair it.",
-            ) from error
-        if after != before:
-            changes.append(SidecarChange(pam.name, before, after))
+    before = pam.read_bytes() if pam.is_file() else None
+    try:
+        after = None if before is None else sidecars.without_placement(before)
+        if reference is not None:
+            after = sidecars.with_srs(after, reference.element())
+    except ValueError as error:
+        raise UnsafeInPlaceError(
+            f"{pam} may override the header of {path.name}, and is no PAM file ({error})",
+            "Remove or repair it.",
+        ) from error
+    if after != before:
+        changes.append(SidecarChange(pam.name, before, after))
     text = sidecars.world_file_text(content.correction.corrected).encode()
     worlds = [(path, path.read_bytes()) for path in sidecars.world_files(raster)]
     changes += [SidecarChange(path.name, old, text) for path, old in worlds if old != text]
@@ -249,6 +264,5 @@ def _preview(raster: Path, edit: Edit, header_bytes: int) -> Iterator[str]:
 
 
 def _has_rpc(raster: Path) -> bool:
-
     with open_raster(raster) as dataset:
         return "RPC" in metadata.domains(dataset)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.resources import files
@@ -13,11 +14,14 @@ from typing import Any
 import numpy as np
 
 from geodelreg import __version__
+from geodelreg.errors import shown
 from geodelreg.product.motion import HeaderMotion, header_motion
 from geodelreg.product.provenance import input_fingerprints, source_date
 from geodelreg.types import Alignment, Correction, Grid, Outcome, Status, TiePoints
 
 SCHEMA_VERSION = "1.2"
+_UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
+"""What terminals obey and JSON need not escape."""
 
 
 def report_schema() -> dict[str, Any]:
@@ -34,7 +38,8 @@ def report_json(alignment: Alignment, tie_points: bool = False) -> str:
 
 def json_text(report: Mapping[str, Any]) -> str:
     """Text of a report: keys sorted, floats exact, no final newline."""
-    return json.dumps(report, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(report, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return _UNSHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any]:
@@ -168,7 +173,7 @@ def summary_text(alignment: Alignment) -> str:
     else:
         lines = [_found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
         lines.append(_next_line(alignment))
-    return "\n".join(line for line in lines if line)
+    return "\n".join(shown(line) for line in lines if line)
 
 
 def _found_line(alignment: Alignment) -> str:

@@ -183,6 +183,26 @@ def with_metadata(pam: bytes | None, domains: Mapping[str, Mapping[str, str]]) -
     return _serialise(root)
 
 
+def srs_text(xml: bytes) -> str | None:
+    """CRS of a PAM file or a VRT as it is stored; None without one.
+
+    Raises
+    ------
+    ValueError
+        The file is neither.
+    """
+    return _parse(xml, "PAMDataset", "VRTDataset").findtext("SRS")
+
+
+def with_srs(pam: bytes | None, srs: ElementTree.Element) -> bytes:
+    """PAM file with another CRS, an ``SRS`` element."""
+    root = ElementTree.Element("PAMDataset") if pam is None else _parse(pam)
+    for old in root.findall("SRS"):
+        root.remove(old)
+    root.insert(0, srs)
+    return _serialise(root)
+
+
 def add_metadata(root: ElementTree.Element, domains: Mapping[str, Mapping[str, str]]) -> None:
     """Add metadata items of the raster to the XML of a PAM file or a VRT."""
     for domain, items in sorted(domains.items()):
@@ -217,14 +237,14 @@ def drop_provenance(root: ElementTree.Element) -> bool:
     return found
 
 
-def _parse(pam: bytes) -> ElementTree.Element:
+def _parse(pam: bytes, *tags: str) -> ElementTree.Element:
     if len(pam) > _MAX_PAM_BYTES or b"<!DOCTYPE" in pam or b"<!ENTITY" in pam:
         raise ValueError("too large, or with a document type")
     try:
         root = ElementTree.fromstring(pam)
     except ElementTree.ParseError as error:
         raise ValueError(str(error)) from error
-    if root.tag != "PAMDataset":
+    if root.tag not in (tags or ("PAMDataset",)):
         raise ValueError(f"root element {root.tag}")
     return root
 

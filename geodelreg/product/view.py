@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +13,7 @@ from affine import Affine
 from geodelreg.door.opening import open_raster, own_name
 from geodelreg.product import metadata, sidecars
 from geodelreg.product.header import Provenance
-
-_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
+from geodelreg.product.srs import SpatialReference, vrt_of
 
 
 @contextmanager
@@ -31,18 +29,16 @@ def corrected_view(
     mask_rules : bool
         Leave out no-data values where the raster has a mask as well, which then rules.
     """
-    import rasterio.shutil
     from rasterio.io import MemoryFile
 
-    with MemoryFile(ext=".vrt") as plain, open_raster(source) as dataset:
-        rasterio.shutil.copy(dataset, plain.name, driver="VRT")
-        root = ElementTree.fromstring(_text(plain.read()))
+    with open_raster(source) as dataset:
+        root, reference = vrt_of(dataset), SpatialReference.of(dataset)
         sidecars.add_metadata(root, _further_domains(dataset, 0))
         for element, band in zip(root.iter("VRTRasterBand"), dataset.indexes, strict=False):
             sidecars.add_metadata(element, _further_domains(dataset, band))
             _set_exactly(element, "Scale", dataset.scales[band - 1])
             _set_exactly(element, "Offset", dataset.offsets[band - 1])
-    _replace_placement(root, content)
+    _replace_placement(root, content, reference)
     _replace_metadata(root, content)
     if mask_rules and root.find("MaskBand") is not None:
         for band in root.findall("VRTRasterBand"):
@@ -54,15 +50,6 @@ def corrected_view(
         own_name(corrected.name, "VRT") as name,
     ):
         yield name, text
-
-
-def _text(xml: bytes) -> str:
-    """XML that GDAL has written; it passes texts of old products on as they are."""
-    try:
-        text = xml.decode()
-    except UnicodeDecodeError:
-        text = xml.decode("latin-1")
-    return _CONTROL.sub("", text)
 
 
 def _set_exactly(band: ElementTree.Element, tag: str, value: float) -> None:
@@ -79,19 +66,21 @@ def _further_domains(dataset: Any, band: int) -> dict[str, dict[str, str]]:
     return {domain: metadata.tags(dataset, band, domain) for domain in plain}
 
 
-def _replace_placement(root: ElementTree.Element, content: Provenance) -> None:
-    for tag in ("GeoTransform", "GCPList"):
+def _replace_placement(
+    root: ElementTree.Element, content: Provenance, reference: SpatialReference | None
+) -> None:
+    for tag in ("SRS", "GeoTransform", "GCPList"):
         for element in root.findall(tag):
             root.remove(element)
+    srs = None if reference is None else reference.element()
     if content.georef == "gcps":
-        srs = root.find("SRS")
-        if srs is not None:
-            root.remove(srs)
         root.insert(0, _gcp_list(content, srs))
-    else:
-        transform = ElementTree.Element("GeoTransform")
-        transform.text = _gdal_order(content.correction.corrected)
-        root.insert(0, transform)
+        return
+    transform = ElementTree.Element("GeoTransform")
+    transform.text = _gdal_order(content.correction.corrected)
+    root.insert(0, transform)
+    if srs is not None:
+        root.insert(0, srs)
 
 
 def _gdal_order(transform: Affine) -> str:

@@ -24,6 +24,7 @@ from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
+from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
 from geodelreg.product.view import corrected_view
 from geodelreg.types import Correction, Grid
@@ -70,6 +71,7 @@ def write_warped(
     reference: Grid,
     tags: Mapping[str, str],
     options: WriteOptions,
+    reference_path: Path | None = None,
 ) -> list[str]:
     """Resample the corrected source raster north-up through GDAL's warper.
 
@@ -88,6 +90,8 @@ def write_warped(
     tags : mapping of str to str
         Provenance, ``GEODELREG_*``.
     options : WriteOptions
+    reference_path : Path, optional
+        The PAN raster: with its grid the target takes its coordinate epoch, too.
 
     Returns
     -------
@@ -107,6 +111,8 @@ def write_warped(
         check_source(source)
         driver = output_driver(target, options.driver)
         grid = _target_grid(source, correction, reference, options)
+        model = reference_path if options.warp_grid == "pan" else source
+        onto = None if model is None else spatial_reference(model)
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), source)
         with staged(target, overwrite=options.overwrite, stale=stale) as out:
             creation = user_creation(options) if driver == "GTiff" else {}
@@ -120,9 +126,12 @@ def write_warped(
                 notes = _warp(source, draft, content, grid, creation, options)
             settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
             content = Provenance(settled, (), tags)
+            kept = keep(onto, draft, target)
             compare.check_placement(draft, target, content, _EXACT_PX)
             if driver != "GTiff":
                 notes += rewrite(draft, out, target, content, options)
+                kept = keep(onto, out, target)
+            notes += kept
     return notes
 
 

@@ -562,7 +562,7 @@ def test_formats_beyond_geojson_name_the_extra_that_is_missing(
 ) -> None:
     (tmp_path / "lakes.gpkg").touch()
     monkeypatch.setitem(__import__("sys").modules, "pyogrio", None)
-    with pytest.raises(MissingExtraError, match=r"geodelreg\[vector\]"):
+    with pytest.raises(MissingExtraError, match=r"'\.\[vector\]'"):
         hidden(write_raster("ms.tif", land()), tmp_path / "lakes.gpkg")
 
 
