@@ -172,18 +172,21 @@ def _read_with_pyogrio(path: str, allow: str) -> tuple[Geometries, str]:
         ) from error
     from shapely import from_wkb
 
-    name = gdal_name(path)
+    suffix = PurePath(path).suffix.lower()
     try:
-        if PurePath(path).suffix.lower() in EXTENSIONS:
+        if suffix in EXTENSIONS:
             check_vector(path, allow)
-        layers = [str(name) for name, kind in pyogrio.list_layers(name) if kind is not None]
+        # OGR writes what it has learned of a GML file beside it, unless the file is in memory
+        in_memory = suffix == ".gml" and is_local(path)
+        opened = Path(path).read_bytes() if in_memory else gdal_name(path)
+        layers = [str(name) for name, kind in pyogrio.list_layers(opened) if kind is not None]
         if len(layers) != 1:
             raise MaskError(
                 f"the mask {path} has {len(layers)} layers with geometries"
                 + (f" ({', '.join(layers)})" if layers else ""),
                 "A mask has one: ogr2ogr -nln mask one.gpkg FILE LAYER.",
             )
-        about, _, binary, _ = read(name, layer=layers[0], columns=[], force_2d=True)
+        about, _, binary, _ = read(opened, layer=layers[0], columns=[], force_2d=True)
         found = from_wkb(binary)
     except (RuntimeError, ValueError, OSError, RasterUnreadableError) as error:
         reason = " ".join(str(error).split())

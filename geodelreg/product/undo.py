@@ -139,6 +139,8 @@ def load(raster: Path) -> list[Edit]:
     """
     path = record_path(raster)
     try:
+        if not path.is_file() and os.path.lexists(path):
+            raise ValueError("no regular file")
         if path.stat().st_size > _LARGEST_BYTES:
             raise ValueError("too large")
         document = json.loads(path.read_bytes())

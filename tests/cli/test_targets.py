@@ -50,6 +50,19 @@ SPECIAL = {"pipe": pipe, "socket": bound_socket, "device": null_device, "link": 
 SPECIAL["folder"] = Path.mkdir
 
 
+@pytest.mark.parametrize(
+    "args", [("revert", "ms.tif"), ("align", "ms.tif", "pan.tif", "--in-place")]
+)
+def test_a_record_of_edits_that_is_a_pipe_is_refused_at_once(
+    geodelreg: Command, pair: Path, args: tuple[str, ...]
+) -> None:
+    os.mkfifo(pair / "ms.tif.geodelreg-undo.json")
+    done = geodelreg(*args, cwd=pair)
+    assert done.returncode == 1
+    assert "ms.tif.geodelreg-undo.json" in done.stderr
+    assert "no regular file" in done.stderr
+
+
 def kinds(folder: Path) -> dict[str, int]:
     return {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()}
 

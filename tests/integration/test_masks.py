@@ -429,7 +429,7 @@ def test_no_geometry_is_a_clear_sky(write_raster: WriteRaster, tmp_path: Path) -
             assert reader.masks.warnings() == ()
 
 
-@pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".fgb"])
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".fgb", ".gml"])
 def test_other_vector_formats_hide_the_same(
     write_raster: WriteRaster, tmp_path: Path, suffix: str
 ) -> None:
@@ -438,7 +438,9 @@ def test_other_vector_formats_hide_the_same(
         path, np.array([shapely.to_wkb(LAKE)], dtype=object), [], [],
         crs="EPSG:32616", geometry_type="Polygon",
     )  # fmt: skip
+    before = sorted(tmp_path.iterdir())
     assert np.array_equal(hidden(image, path), expected(image, LAKE))
+    assert sorted(tmp_path.iterdir()) == before
 
 
 # --- what is said --------------------------------------------------------------------------------
