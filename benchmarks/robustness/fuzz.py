@@ -44,7 +44,7 @@ HANG_S = 30.0
 WAIT_S = 300.0
 """Of wall time, for a case that waits for something."""
 
-HOSTILE_WAIT_S = 40.0
+HOSTILE_WAIT_S = 150.0
 """Of wall time, for a hostile case: it is small, and what it waits for never comes."""
 
 LARGEST_RSS = 1_500_000_000

@@ -16,7 +16,7 @@ from geodelreg.errors import GeodelregError
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg.types import Correction
 
-_PATIENCE_S = 25.0
+_PATIENCE_S = 120.0
 """For the command; what is waited for a warm worker is longer."""
 _ENDINGS = (0, 1, 2, 3, 4)
 
