@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from time import perf_counter
 
+from geodelreg.align_pair import align_pair
 from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
@@ -18,25 +18,22 @@ from geodelreg.errors import (
 )
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
+from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg.pipeline.check import (
-    is_affine_enough,
-    judge_misalignment,
-    measure_misalignment,
-)
-from geodelreg.pipeline.register import correction_of, register
-from geodelreg.pipeline.solve import Solution
-from geodelreg.pipeline.state import Pair, Progress
+from geodelreg.pair import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.provenance import fingerprint, provenance_tags, versions
-from geodelreg.types import (
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import (
     Alignment,
     CheckOutcome,
     Correction,
-    Gcp,
+    Input,
     Misalignment,
     Outcome,
+    Solution,
 )
+from geodelreg.values.timings import Timings
 
 AnyPath = str | PathLike[str]
 MAX_LIMIT_PX = 1e6
@@ -44,23 +41,35 @@ MAX_LIMIT_PX = 1e6
 
 @dataclass(frozen=True, slots=True)
 class _Rasters:
-    """The two rasters, open, and their paths as the user named them."""
+    """The two rasters, open, as the user named them, and how long it all takes."""
 
     ms: RasterReader
     pan: RasterReader
-    source_paths: tuple[str, ...]
-    reference_path: str
+    source: Input
+    reference: Input
+    timings: Timings
 
 
 @contextmanager
 def _open(
     source: AnyPath | Sequence[AnyPath], reference: AnyPath, options: AlignOptions
 ) -> Iterator[_Rasters]:
-    with (
-        open_raster(source, options.masks, allow=options.allow) as ms,
-        open_raster(reference, options.pan_masks, allow=options.allow) as pan,
-    ):
-        yield _Rasters(ms, pan, _paths(source), str(reference))
+    timings = Timings()
+    with ExitStack() as stack:
+        with timings("open"):
+            ms = stack.enter_context(open_raster(source, options.masks, allow=options.allow))
+            pan = stack.enter_context(
+                open_raster(reference, options.pan_masks, allow=options.allow)
+            )
+            if options.band:
+                check_band(ms, options.band)
+            check_band(pan, options.pan_band)
+            inputs = _input(ms, _paths(source)), _input(pan, (str(reference),))
+        yield _Rasters(ms, pan, *inputs, timings)
+
+
+def _input(reader: RasterReader, paths: tuple[str, ...]) -> Input:
+    return Input(paths, reader.grid, tuple(map(fingerprint, paths)))
 
 
 def align(
@@ -99,9 +108,8 @@ def align(
         Its other kinds, for bad input.
     """
     options = options or AlignOptions()
-    start = perf_counter()
     with _open(source, reference, options) as rasters:
-        alignment, _ = _examine(rasters, options, progress, start)
+        alignment, _ = _examine(rasters, options, progress)
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
         raise AlignmentRefusedError(
@@ -155,11 +163,10 @@ def check(
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options = replace(options or AlignOptions(), tolerance_px=0.0)
-    start = perf_counter()
     with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = _part_of(progress, 0, count + 1)
-        alignment, misalignment = _examine(rasters, options, report, start)
+        alignment, misalignment = _examine(rasters, options, report)
         bands = [
             _check_band(
                 rasters,
@@ -189,7 +196,7 @@ def _check_band(
     assert options.band is not None
     name = rasters.ms.band_names[options.band - 1]
     try:
-        pair, solution = register(rasters.ms, rasters.pan, options, progress)
+        pair, solution = align_pair(rasters.ms, rasters.pan, options, progress)
     except (NoDataError, NoOverlapError) as error:
         return BandCheck(options.band, name, CheckOutcome.CANNOT_TELL, reason=error.cause)
     misalignment = measure_misalignment(pair, solution)
@@ -207,54 +214,33 @@ def _part_of(progress: Progress | None, number: int, count: int) -> Progress | N
 
 
 def _examine(
-    rasters: _Rasters,
-    options: AlignOptions,
-    progress: Progress | None,
-    start: float,
+    rasters: _Rasters, options: AlignOptions, progress: Progress | None
 ) -> tuple[Alignment, Misalignment]:
-    """Register two open rasters; `start` is when opening them began."""
+    """Align two open rasters."""
     ms, pan = rasters.ms, rasters.pan
-    if options.band:
-        check_band(ms, options.band)
-    check_band(pan, options.pan_band)
-    files = (*rasters.source_paths, rasters.reference_path)
-    prints = {path: fingerprint(path) for path in files}
-    opened = perf_counter() - start
     try:
-        pair, solution = register(ms, pan, options, progress)
+        pair, solution = align_pair(ms, pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
-    alignment = _alignment(rasters, pair, solution)
     notes = tuple(note for note in (ms.block_note, pan.block_note) if note)
-    timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
-    alignment = replace(
-        alignment,
-        timings_s=timings,
-        warnings=alignment.warnings + notes + mask_warnings(ms, pan),
-        extra={"fingerprints": prints},
-    )
+    alignment = _alignment(rasters, pair, solution, notes + mask_warnings(ms, pan))
     return alignment, measure_misalignment(pair, solution)
 
 
-def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
+def _alignment(
+    rasters: _Rasters, pair: Pair, solution: Solution, notes: tuple[str, ...] = ()
+) -> Alignment:
     masks = mask_uses(rasters.ms, rasters.pan)
     return Alignment(
-        source=pair.source.grid,
-        reference=pair.reference.grid,
-        source_paths=rasters.source_paths,
-        reference_path=rasters.reference_path,
-        correction=correction_of(pair, solution),
-        tie_points=solution.tie_points,
-        accuracy=solution.accuracy,
-        verdict=solution.verdict,
-        step_counts=solution.step_counts,
-        band_weights=solution.band_weights,
-        warnings=solution.warnings,
-        crs_operation=pair.mapping.operation.description,
+        source=rasters.source,
+        reference=rasters.reference,
+        solution=solution,
         options=pair.options,
-        versions=versions(with_proj=pair.through_proj or bool(masks)),
-        timings_s=solution.timings_s,
+        crs_operation=pair.header.operation.description,
+        warnings=solution.warnings + notes,
         masks=masks,
+        versions=versions(with_proj=pair.through_proj or bool(masks)),
+        timings_s={**pair.timings, "total": pair.timings.elapsed_s},
     )
 
 
@@ -295,7 +281,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     for path, out in _targets(alignment, Path(target)):
         correction, gcps = _of_file(alignment, path)
         if options.warp:
-            notes += write_warped(path, out, correction, alignment.reference, tags, options)
+            notes += write_warped(path, out, correction, alignment.reference.grid, tags, options)
         else:
             notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
@@ -318,11 +304,11 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.inplace import edit_in_place
 
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
-        tidy(map(Path, alignment.source_paths))
+        tidy(map(Path, alignment.source.paths))
         return []
     tags = provenance_tags(alignment)
     notes: list[str] = []
-    for name in alignment.source_paths:
+    for name in alignment.source.paths:
         notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
     return notes
 
@@ -366,7 +352,7 @@ def export_gcps(
 
 def _targets(alignment: Alignment, target: Path) -> list[tuple[Path, Path]]:
     """MS files with their outputs."""
-    sources = [Path(path) for path in alignment.source_paths]
+    sources = [Path(path) for path in alignment.source.paths]
     if len(sources) == 1:
         return [(sources[0], target)]
     try:
@@ -384,7 +370,7 @@ def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, .
     from geodelreg.product.gcps import gcps_from_alignment
 
     gcps, shared = gcps_from_alignment(alignment), alignment.correction
-    if len(alignment.source_paths) == 1:
+    if len(alignment.source.paths) == 1:
         return shared, gcps
     with open_raster(path, allow=alignment.options.allow) as reader:
         own = reader.grid.transform

@@ -15,7 +15,8 @@ from benchmarks.paper.methods import METHODS, STEPS, Matched, Stage, match_plain
 from benchmarks.paper.page import CONTAMINATION, MEASURES, effect, group, spread_of
 from benchmarks.paper.scenes import Case
 from geodelreg.geo.triangulation import delaunay
-from geodelreg.types import Band, BoolArray, FloatArray, Status
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Band, BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

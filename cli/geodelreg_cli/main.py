@@ -16,8 +16,8 @@ from importlib import import_module
 
 import click
 
-from geodelreg import __version__
 from geodelreg.errors import AlignmentRefusedError, GeodelregError
+from geodelreg.version import __version__
 from geodelreg_cli.interrupts import Terminated, termination_as_exception
 
 # name: (module that holds the click command of that name, line in the list of commands)

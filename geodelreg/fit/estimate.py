@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.models import PARAMETER_COUNT, Frame, Transformation, design, transformation
-from geodelreg.types import BoolArray, FloatArray, IntArray
+from geodelreg.fit.models import PARAMETER_COUNT, Frame, design, fitted_map
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
 _STUDENT_DOF = 6.0
@@ -48,8 +49,9 @@ class Estimate:
 
     Attributes
     ----------
-    transformation : Transformation
-        Source pixels to header pixels.
+    model : str
+    map : PixelMap
+        Source pixels to header pixels, with its standard error.
     parameters : (k,) float64
     covariance : (k, k) float64
         Of the parameters, from the residuals' real spread.
@@ -61,7 +63,8 @@ class Estimate:
         Squared Mahalanobis distance of each residual.
     """
 
-    transformation: Transformation
+    model: str
+    map: PixelMap
     parameters: FloatArray
     covariance: FloatArray
     frame: Frame
@@ -69,11 +72,10 @@ class Estimate:
     inlier: BoolArray
     distance2: FloatArray
 
-    def sigma_at(self, xy: FloatArray) -> FloatArray:
-        """(N,) standard error (radial, source pixels) of the transformation at (N, 2) pixels."""
-        columns, _ = design(self.transformation.model, xy, self.frame)
-        spread = np.einsum("nik,kl,nil->n", columns, self.covariance, columns)
-        return np.asarray(np.sqrt(np.maximum(spread, 0)) * self.frame.span_px)
+    @property
+    def is_shift(self) -> bool:
+        """True when nothing but a shift was fitted."""
+        return self.model == "shift"
 
 
 def minimum_points(model: str) -> int:
@@ -153,7 +155,7 @@ def robust_fit(
     for number in range(20):
         inverse = _inverse(points.covariance, extra)
         parameters, normal = _solve(columns, right, inverse * student[:, None, None], frame)
-        residual = transformation(model, parameters, frame).residuals(points.source, points.target)
+        residual = fitted_map(model, parameters, frame).forward(points.source) - points.target
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = _variance_left(residual, variances, axes)
             inverse = _inverse(points.covariance, extra)
@@ -166,7 +168,7 @@ def robust_fit(
     sandwich = _sandwich(columns, inverse * student[:, None, None], residual, normal, frame)
     sandwich = sandwich / _response(distance2) ** 2
     return Estimate(
-        transformation(model, parameters, frame),
+        model, fitted_map(model, parameters, frame, sandwich),
         parameters, sandwich, frame, extra, inlier, distance2,
     )  # fmt: skip
 

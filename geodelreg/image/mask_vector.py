@@ -14,7 +14,7 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.image.paths import is_local
 from geodelreg.masking import AUTO, VECTOR, MaskSpec
-from geodelreg.types import BoolArray, FloatArray, Grid
+from geodelreg.values.raster import BoolArray, FloatArray, Grid
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry

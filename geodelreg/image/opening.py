@@ -23,7 +23,7 @@ from geodelreg.image.access import LOCAL, check_name, drivers
 from geodelreg.image.environment import gdal_calls
 from geodelreg.image.paths import is_local
 from geodelreg.image.vrt_sources import check_regular, check_vrt_sources, is_vrt
-from geodelreg.types import Grid
+from geodelreg.values.raster import Grid
 
 if TYPE_CHECKING:
     from rasterio.crs import CRS

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.product.atomic import staged
-from geodelreg.types import Alignment, Band, FloatArray, Grid, IntArray
+from geodelreg.values.raster import Band, FloatArray, Grid, IntArray
+from geodelreg.values.result import Alignment
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,8 +100,8 @@ def draw_matches(
     """
     points = alignment.tie_points
     sides = [
-        (ms_band, _shown(points.source_px, alignment.source, ms_band.grid)),
-        (pan_band, _shown(points.reference_px, alignment.reference, pan_band.grid)),
+        (ms_band, _shown(points.source_px, alignment.source.grid, ms_band.grid)),
+        (pan_band, _shown(points.reference_px, alignment.reference.grid, pan_band.grid)),
     ]
     # both panels are one unit high
     widths = [band.data.shape[1] / band.data.shape[0] for band, _ in sides]
@@ -224,7 +225,7 @@ def draw_residuals(alignment: Alignment, path: str | Path, *, overwrite: bool = 
         field, cloud, histogram = figure.subplot_mosaic(
             [["field", "cloud"], ["field", "histogram"]], width_ratios=(1.7, 1.0)
         ).values()
-        _draw_field(field, alignment.source, xy, residual, lengths)
+        _draw_field(field, alignment.source.grid, xy, residual, lengths)
         _draw_cloud(cloud, residual, ce90, limit)
         _draw_histogram(histogram, lengths, ce90, limit)
         rmse = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")

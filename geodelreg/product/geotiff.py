@@ -21,7 +21,8 @@ from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import output_driver, rewrite
 from geodelreg.product.tiffwrite import copy_with_header, is_cog
 from geodelreg.tiff import is_tiff
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 _EXACT_PX = 1e-6
 _REWRITTEN_PX = 1e-4

@@ -15,7 +15,8 @@ from geodelreg.errors import RasterUnreadableError
 from geodelreg.product import geotags
 from geodelreg.product.environment import gdal_failures
 from geodelreg.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 Domains = Mapping[str, Mapping[str, str]]
 Metadata = Sequence[Domains]

@@ -24,7 +24,8 @@ from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Provenance
 from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
 from geodelreg.product.view import corrected_view
-from geodelreg.types import Correction, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Correction
 
 _TOLERANCE_PX = 1e-3
 """Of GDAL's approximation of the way between two CRSs."""

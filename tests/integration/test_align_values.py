@@ -15,8 +15,8 @@ from rasterio.enums import Resampling
 from scipy import ndimage
 
 from geodelreg import align, check
-from geodelreg.pipeline.state import MOST_BANDS
-from geodelreg.types import Outcome
+from geodelreg.pair import MOST_BANDS
+from geodelreg.values.result import Outcome
 from tests.integration.align_scenes import (
     Pixels,
     Recipe,
@@ -108,14 +108,14 @@ def test_of_very_many_bands_some_are_matched(standard: Scene, tmp_path: Path) ->
     ms = changed(standard.ms, tmp_path, many, 0)
     alignment = align(ms, standard.pan)
     assert standard.rmse_px(alignment.correction.corrected) < 0.1
-    assert MOST_BANDS / 2 < len(alignment.band_weights) <= MOST_BANDS
+    assert MOST_BANDS / 2 < len(alignment.solution.band_weights) <= MOST_BANDS
     assert any("of 90 bands" in warning for warning in alignment.warnings)
 
 
 def test_one_band_is_enough(standard: Scene, tmp_path: Path) -> None:
     alignment = align(changed(standard.ms, tmp_path, lambda data: data[1:2]), standard.pan)
     assert standard.rmse_px(alignment.correction.corrected) < 0.1
-    assert list(alignment.band_weights) == ["band 1"]
+    assert list(alignment.solution.band_weights) == ["band 1"]
 
 
 @pytest.mark.parametrize("resampling", [Resampling.nearest, Resampling.cubic])

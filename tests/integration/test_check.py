@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 import geodelreg
 from geodelreg.errors import UsageError
-from geodelreg.pipeline.advice import local_distortion, many_elsewhere
-from geodelreg.pipeline.check import is_affine_enough, judge_misalignment
+from geodelreg.fine.layers import many_elsewhere
+from geodelreg.judge.check import is_affine_enough, judge_misalignment
+from geodelreg.judge.words import local_distortion
 from geodelreg.product.check import check_dict, check_text
 from geodelreg.product.report import report_schema
-from geodelreg.types import CheckOutcome, FloatArray, Misalignment, Status, TiePoints
+from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.raster import FloatArray
+from geodelreg.values.result import CheckOutcome, Misalignment
 from tests.cli.helpers import SAMPLES
 
 TRUTH = json.loads((SAMPLES / "truth.json").read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ from rasterio.env import get_gdal_config, set_gdal_config
 
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.image.reader import check_band, open_raster
-from geodelreg.types import Band, Window
+from geodelreg.values.raster import Band, Window
 from tests.conftest import TRANSFORM, WriteRaster
 
 RNG = np.random.default_rng(7)

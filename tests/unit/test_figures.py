@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import MissingExtraError, OutputExistsError, UsageError
 from geodelreg.product.figures import draw_before_after, draw_matches, draw_residuals
-from geodelreg.types import Band, Grid, TiePoints
+from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import Band, Grid
 from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, UTM16, alignment, refused
 
 KEPT = np.array([255, 207, 51])
@@ -53,7 +54,6 @@ def only(points: TiePoints, *indices: int) -> TiePoints:
         points.covariance_px2[chosen],
         points.score[chosen],
         points.status[chosen],
-        points.is_check[chosen],
         points.residual_px[chosen],
     )
 
@@ -68,7 +68,7 @@ def test_a_tie_point_stands_on_its_pixel_in_both_images(tmp_path: Path) -> None:
     ms = band((30, 40), MS_HEADER @ Affine.translation(20, 20) @ Affine.scale(2.0))
     pan = band((320, 400), PAN_HEADER)
     path = tmp_path / "matches.png"
-    draw_matches(ms, pan, replace(made, tie_points=point), path)
+    draw_matches(ms, pan, replace(made, solution=replace(made.solution, tie_points=point)), path)
     image = pixels(path)
 
     dark = image.max(axis=2) < 60
@@ -113,7 +113,7 @@ def test_given_triangles_index_all_tie_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [(), (0,), (1, 2)])
 def test_too_few_points_for_a_mesh(tmp_path: Path, kept: tuple[int, ...]) -> None:
     made = alignment()
-    few = replace(made, tie_points=only(made.tie_points, *kept))
+    few = replace(made, solution=replace(made.solution, tie_points=only(made.tie_points, *kept)))
     ms, pan = band((80, 100), MS_HEADER), band((320, 400), PAN_HEADER)
     draw_matches(ms, pan, few, tmp_path / "few.png")
     assert (pixels(tmp_path / "few.png") < 60).any()
@@ -127,7 +127,7 @@ def test_points_on_one_line_have_no_mesh(tmp_path: Path) -> None:
     draw_matches(
         band((80, 100), MS_HEADER),
         band((320, 400), PAN_HEADER),
-        replace(made, tie_points=line),
+        replace(made, solution=replace(made.solution, tie_points=line)),
         tmp_path / "line.png",
     )
     assert (tmp_path / "line.png").exists()
@@ -142,7 +142,6 @@ def test_many_points_are_thinned_to_a_spread_of_lines(tmp_path: Path) -> None:
         np.tile(np.eye(2), (5000, 1, 1)),
         np.ones(5000),
         (rng.random(5000) < 0.3).astype(np.uint8),
-        np.zeros(5000, dtype=bool),
         rng.normal(0, 0.1, (5000, 2)),
     )
     made = alignment(tie_points=many)

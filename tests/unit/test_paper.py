@@ -28,9 +28,10 @@ from benchmarks.paper.methods import (
 from benchmarks.paper.scenes import crop_pan
 from benchmarks.scenes.make import Scene
 from benchmarks.scenes.truth import Truth
-from geodelreg.match.keypoints import KeypointOptions, detect
-from geodelreg.match.zhang2013 import match_sift, match_zhang2013
-from geodelreg.types import Band, Float32Array, Grid, Status, Window
+from geodelreg.coarse.keypoints import KeypointOptions, detect
+from geodelreg.paper.zhang2013 import match_sift, match_zhang2013
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Band, Float32Array, Grid, Window
 
 UTM18 = CRS.from_epsg(32618).to_wkt()
 PAN = Affine(10.0, 0.0, 500_000.0, 0.0, -10.0, 4_000_000.0)
