@@ -187,10 +187,7 @@ def check(
 
 
 def _check_band(
-    rasters: _Rasters,
-    options: AlignOptions,
-    limit_px: float,
-    progress: Progress | None,
+    rasters: _Rasters, options: AlignOptions, limit_px: float, progress: Progress | None
 ) -> BandCheck:
     """One band by itself; a band that shows nothing spoils no other."""
     assert options.band is not None

@@ -21,12 +21,7 @@ from geodelreg.fine.looks import band_looks, mean_band
 from geodelreg.fine.overlay import overlay
 from geodelreg.fine.surface import make_surface
 from geodelreg.fit.chance import log_nfa
-from geodelreg.fit.consensus import (
-    Consensus,
-    consensus_keypoints,
-    fit_plainly,
-    radial_residuals,
-)
+from geodelreg.fit.consensus import Consensus, consensus_keypoints, fit_plainly, radial_residuals
 from geodelreg.fit.delaunay_mesh import FilterOptions, filter_matches
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap

@@ -16,6 +16,9 @@ MAD_TO_SIGMA = 1.4826
 def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
     """Minimise ``w' G w − 2 m' w`` over w ≥ 0 by an active set (Lawson & Hanson 1974).
 
+    By hand: scipy.optimize, whose nnls finds the same, takes 0.3 s and 38 MB to load, a quarter of
+    what aligning the sample takes altogether.
+
     Parameters
     ----------
     gram : (B, B) float64
@@ -29,25 +32,22 @@ def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
     if (unbounded > 0).all():
         return unbounded
     for _ in range(3 * count):
-        slope = moment - ridge @ weights
-        slope[passive] = -np.inf
+        slope = np.where(passive, -np.inf, moment - ridge @ weights)
         best = int(np.argmax(slope))
-        if passive.all() or slope[best] <= 1e-9 * float(np.abs(moment).max() + 1e-30):
+        if slope[best] <= 1e-9 * float(np.abs(moment).max() + 1e-30):
             break
         passive[best] = True
-        while True:
+        while passive.any():
             trial = np.zeros(count)
             trial[passive] = np.linalg.solve(ridge[np.ix_(passive, passive)], moment[passive])
-            if (trial[passive] > 0).all():
+            below = passive & (trial <= 0)
+            if not below.any():
                 weights = trial
                 break
-            shrink = passive & (trial <= 0)
-            step = np.min(weights[shrink] / np.maximum(weights[shrink] - trial[shrink], 1e-30))
+            step = np.min(weights[below] / np.maximum(weights[below] - trial[below], 1e-30))
             weights = weights + step * (trial - weights)
             passive &= weights > 1e-12 * max(float(weights.max()), 1e-30)
             weights[~passive] = 0.0
-            if not passive.any():
-                return weights
     return weights
 
 

@@ -32,7 +32,7 @@ ELSEWHERE = (Status.CONSENSUS, Status.STAR, Status.RESIDUAL)
 LOCAL_RMS_PX = 0.3
 """Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
 
-_BINS = 256
+_GREYS = 256
 _GROWTH_PX = 5
 _SEPARATION = 3.5
 _LEAST_SPREAD = 1e-4
@@ -67,14 +67,12 @@ def bright_threshold(band: Band) -> float | None:
     low, high = np.percentile(values, [0.5, 99.5])
     if not high - low > _LEAST_SPREAD * max(abs(low), abs(high)):
         return None
-    counts, edges = np.histogram(values, bins=_BINS, range=(float(low), float(high)))
-    share = np.cumsum(counts) / max(int(counts.sum()), 1)
-    centre = (edges[:-1] + edges[1:]) / 2
-    mean = np.cumsum(counts * centre) / max(int(counts.sum()), 1)
-    between = (mean[-1] * share - mean) ** 2 / np.maximum(share * (1 - share), 1e-9)
-    best = int(np.argmax(between[:-1]))
-    bright = 1.0 - share[best]
-    threshold = float(edges[best + 1])
+    inside = values[(values >= low) & (values <= high)]
+    step = (high - low) / _GREYS
+    grey = np.minimum((inside - low) / step, _GREYS - 1).astype(np.uint8)
+    cut, _ = cv2.threshold(grey, 0, _GREYS - 1, cv2.THRESH_OTSU)
+    threshold = float(low + (cut + 1) * step)
+    bright = float((inside > threshold).mean())
     dark = values[values <= threshold]
     apart = float(values[values > threshold].mean() - dark.mean()) if 0 < bright < 1 else 0.0
     if not 0.01 < bright < 0.9 or apart < _SEPARATION * float(dark.std()):

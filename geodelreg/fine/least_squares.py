@@ -18,12 +18,7 @@ from geodelreg.fine.surface import Surface, sample_patches
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
-from geodelreg.values.raster import (
-    BoolArray,
-    Float32Array,
-    FloatArray,
-    StatusArray,
-)
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, StatusArray
 
 ROUGH_STEP = 0.04
 """Tolerance where hundredths of a pixel suffice: the step after such a one is much smaller."""
@@ -98,10 +93,7 @@ class Matched:
 
 
 def match_patches(
-    patches: Patches,
-    surfaces: Sequence[Surface],
-    there: PixelMap,
-    options: MatchOptions,
+    patches: Patches, surfaces: Sequence[Surface], there: PixelMap, options: MatchOptions
 ) -> Matched:
     """Match patches, each on its surface.
 

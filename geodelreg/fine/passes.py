@@ -217,12 +217,7 @@ def _passes(
 
 
 def _approach(
-    part: Roles,
-    tiles: list[Tile],
-    near: PixelMap,
-    options: MatchOptions,
-    look: Look,
-    passes: int,
+    part: Roles, tiles: list[Tile], near: PixelMap, options: MatchOptions, look: Look, passes: int
 ) -> Refinement | None:
     """Passes towards the map and the point spread, from a start a few pixels off."""
     local = look.local_tone and part.ms_is_template

@@ -239,11 +239,7 @@ def _evaluate(
         for image, mine in zip(coefficients, rows, strict=True):
             if mine.start < mine.stop:
                 out[mine] = cv2.remap(
-                    image,
-                    at_x[mine],
-                    at_y[mine],
-                    cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_REPLICATE,
+                    image, at_x[mine], at_y[mine], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
                 )
         return out
 

@@ -60,11 +60,7 @@ def decimation(band: Band, full: Grid) -> tuple[float, float]:
 
 
 def fit_tone(
-    part: Roles,
-    tiles: list[Tile],
-    correction: PixelMap,
-    sigma: float,
-    samples: int = _TONE_SAMPLES,
+    part: Roles, tiles: list[Tile], correction: PixelMap, sigma: float, samples: int = _TONE_SAMPLES
 ) -> SyntheticPan:
     """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
     there, per_tile = part.to_surface(correction), max(samples // len(tiles), 64)

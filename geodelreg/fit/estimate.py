@@ -185,11 +185,7 @@ def _inverse(covariance: FloatArray, extra: float) -> FloatArray:
 
 
 def _sandwich(
-    columns: FloatArray,
-    weight: FloatArray,
-    residual: FloatArray,
-    normal: FloatArray,
-    frame: Frame,
+    columns: FloatArray, weight: FloatArray, residual: FloatArray, normal: FloatArray, frame: Frame
 ) -> FloatArray:
     """Covariance of the parameters from the residuals themselves, as if each point were left out.
 
@@ -244,7 +240,8 @@ def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray
     if not at_low > 0.0:
         return 0.0
     at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), 1e-300)
-    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick
+    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick, and
+    # scipy.optimize, whose brentq takes as many steps, takes 0.3 s to load
     kept = 0
     for _ in range(_MOST_STEPS):
         middle = high - at_high * (high - low) / (at_high - at_low)

@@ -19,7 +19,6 @@ _FIT_ROUNDS = 2
 _CAUCHY_TUNING = 2.0
 _NEARNESS = 3.0
 _LOWER_QUARTILE = 0.5754
-_MAX_DISTANCES = 4_000_000
 
 
 class Field(NamedTuple):
@@ -108,7 +107,9 @@ def stars_of(targets: FloatArray, xy: FloatArray, own: Star) -> Star:
     own : Star
         `own_stars` of these points.
     """
-    nearest = _nearest(targets, xy)
+    from shapely import STRtree, points
+
+    nearest = STRtree(np.asarray(points(xy))).nearest(np.asarray(points(targets)))
     start = np.searchsorted(own.target, np.arange(len(xy) + 1))
     size = np.diff(start)[nearest]
     target = np.repeat(np.arange(len(targets)), size + 1)
@@ -212,15 +213,3 @@ def _medians(target: IntArray, values: FloatArray, count: int) -> FloatArray:
 def _running(sizes: IntArray) -> IntArray:
     """0, 1, ... for each of consecutive groups of the given sizes."""
     return np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-
-
-def _nearest(targets: FloatArray, xy: FloatArray) -> IntArray:
-    """(T,) intp, index of the point nearest to each target."""
-    nearest = np.empty(len(targets), dtype=np.intp)
-    rows = max(1, _MAX_DISTANCES // max(len(xy), 1))
-    for begin in range(0, len(targets), rows):
-        block = targets[begin : begin + rows]
-        distance2 = (block[:, :1] - xy[:, 0]) ** 2
-        distance2 += (block[:, 1:] - xy[:, 1]) ** 2
-        nearest[begin : begin + rows] = distance2.argmin(axis=1)
-    return nearest

@@ -111,11 +111,7 @@ def best_in_place(scores: FloatArray) -> AreaEvidence:
 
 
 def _explained(
-    to_surface: PixelMap,
-    surface: Surface,
-    patches: Patches,
-    chosen: IntArray,
-    offsets: FloatArray,
+    to_surface: PixelMap, surface: Surface, patches: Patches, chosen: IntArray, offsets: FloatArray
 ) -> FloatArray:
     """(P, K) share of the surface's variance that the bands explain, per patch and offset.
 

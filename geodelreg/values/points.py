@@ -7,13 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from geodelreg.values.raster import (
-    BoolArray,
-    Float32Array,
-    FloatArray,
-    IntArray,
-    StatusArray,
-)
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, IntArray, StatusArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

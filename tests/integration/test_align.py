@@ -190,7 +190,7 @@ def test_one_file_per_band_gets_the_correction_of_one_file(standard: Scene, tmp_
     check(standard, apart)
     assert apart.correction.corrected == together.correction.corrected
     assert apart.source.paths == tuple(map(str, files))
-    assert list(apart.band_weights) == ["B1", "B2", "B3", "B4"]
+    assert list(apart.solution.band_weights) == ["B1", "B2", "B3", "B4"]
 
 
 def content(alignment: Alignment) -> bytes:

@@ -137,8 +137,8 @@ def points_of_relief(amplitude_px: float = 1.2, elsewhere_px: float = 3.0) -> Ti
     residual[:, 0] += amplitude_px * np.sin(2 * np.pi * source[:, 1] / 1000)
     residual[600:] = elsewhere_px
     status = np.where(np.arange(900) < 600, Status.KEPT, Status.RESIDUAL).astype(np.uint8)
-    one, no = np.ones(900), np.zeros(900, dtype=bool)
-    return TiePoints(source, source, np.tile(np.eye(2), (900, 1, 1)), one, status, no, residual)
+    covariance = np.tile(np.eye(2), (900, 1, 1))
+    return TiePoints(source, source, covariance, np.ones(900), status, residual)
 
 
 def test_distortion_counts_although_many_lie_elsewhere() -> None:
