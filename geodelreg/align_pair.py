@@ -20,15 +20,16 @@ from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, verdict
 from geodelreg.judge.words import warnings_of
 from geodelreg.options import AlignOptions
-from geodelreg.pair import Pair, Progress, make_pair, overlap_corners, roles
+from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.guess import Guess
 from geodelreg.values.points import NO_TIE_POINTS, Status
 from geodelreg.values.raster import WindowReader
 from geodelreg.values.result import Accuracy, Solution
 from geodelreg.values.timings import Timings
 
-_NEGLIGIBLE_PX = 0.005
+_NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
 _FEWEST_POINTS = 4
+_OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
 
 
 class Found(NamedTuple):
@@ -79,9 +80,9 @@ def align_pair(
     refused: list[Solution] = []
     heard: list[Claim] = []
     looked = 0.0
-    report(0.02, "reading")
+    report(_OPENED, "reading")
     for seen, guess in pair.timings.each("search", guesses(pair)):
-        report(0.4 + looked / 4, "refining")
+        report(_FOUND + looked / 4, "refining")
         if is_degenerate(guess):
             continue  # of headers that squeeze the ground to a line
         found = find(seen, guess)
@@ -120,7 +121,7 @@ def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
         points = last.points.take(kept)
         if len(points) < _FEWEST_POINTS:
             return None
-        negligible = _NEGLIGIBLE_PX / max(pair.pan_px_per_source_px, 1e-9)
+        negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
         frame, model = Frame.of(pair), pair.options.model
         selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
         estimate = selection.estimate
@@ -150,7 +151,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
     estimate = fitted.selection.estimate
     with pair.timings("evidence"):
         accuracy, evidence = gather(guess, refined, fitted, heard)
-        spots = pair.source_lattice(5)
+        spots = pair.source_lattice(LATTICE)
         move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
         sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px
         moves = is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)

@@ -23,6 +23,10 @@ MOST_BANDS = 12
 _LARGEST_RATIO = 1e4
 """Of the largest pixel size of the two rasters to the smallest."""
 
+LATTICE = 5  # places along either axis of MS at which maps are compared: smooth in between
+_EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRSs are curved
+_ROUNDING = 1e-6  # of a quotient of pixel sizes that went through a change of CRS
+
 Progress = Callable[[float, str], None]
 
 
@@ -57,7 +61,7 @@ class Pair:
     @property
     def source_is_coarser(self) -> bool:
         """True when an MS pixel is at least as large as a PAN pixel."""
-        return self.source_area_ratio >= 1.0 - 1e-6
+        return self.source_area_ratio >= 1.0 - _ROUNDING
 
     @property
     def source_area_ratio(self) -> float:
@@ -237,7 +241,7 @@ def outline(grid: Grid, per_edge: int) -> FloatArray:
 
 def overlap_in_template(part: Roles, correction: PixelMap) -> Window | None:
     """Bounding window, in the template, of what the surface raster covers under a correction."""
-    points = part.to_surface(correction).inverse(outline(part.surface.grid, 16))
+    points = part.to_surface(correction).inverse(outline(part.surface.grid, _EDGE_PLACES))
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         return None

@@ -10,11 +10,15 @@ import cv2
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
-from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
+from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
 
-_PIXELS = 90_000
-_SEARCH_OVERLAP = 0.15
+_PIXELS = 90_000  # at most, 300²; unexplained: ablate
+_SEARCH_OVERLAP = 0.15  # of the smaller image; unexplained: ablate
 _HIGH_PASS_SIGMA_PX = 4.0
+_CLIP_SIGMAS = 3.0
+_ALL_VALID = 0.99  # share of a pixel, when decimated; the rest is rounding
+_LEAST_SHARE = 1e-3  # of weight: means of less are not asked for
+_LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
 
 
 def best_shift(overlay: Overlay) -> FloatArray:
@@ -79,10 +83,10 @@ def _detail(
         weight = np.asarray(cv2.resize(weight, shape, interpolation=cv2.INTER_AREA), np.float32)
     smooth = cv2.GaussianBlur(centred, (0, 0), _HIGH_PASS_SIGMA_PX)
     share = cv2.GaussianBlur(weight, (0, 0), _HIGH_PASS_SIGMA_PX)
-    mask = (weight > 0.99).astype(np.float32)
-    detail = (centred - smooth / np.maximum(share, 1e-3)) * mask
+    mask = (weight > _ALL_VALID).astype(np.float32)
+    detail = (centred - smooth / np.maximum(share, _LEAST_SHARE)) * mask
     spread = float(np.sqrt((detail**2).sum() / max(float(mask.sum()), 1.0)))
-    detail = np.clip(detail / max(spread, 1e-12), -3, 3)
+    detail = np.clip(detail / max(spread, TINY), -_CLIP_SIGMAS, _CLIP_SIGMAS)
     return np.asarray(detail, dtype=np.float32), np.asarray(mask, dtype=np.float32)
 
 
@@ -117,5 +121,5 @@ def masked_correlation(
     power_one = correlate(spectrum(one * one), mask_b)
     power_other = correlate(mask_a, spectrum(other * other))
     enough = overlap > least_overlap
-    power = np.sqrt(np.maximum(power_one * power_other, 1e-6))
+    power = np.sqrt(np.maximum(power_one * power_other, _LEAST_POWER))
     return np.asarray(np.where(enough, together / power, 0.0), dtype=np.float32), overlap

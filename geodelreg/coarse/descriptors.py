@@ -7,7 +7,7 @@ import numpy as np
 from geodelreg.values.points import Keypoints, Matches
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, IntArray
 
-BLOCK_ROWS = 1024
+BLOCK_ROWS = 1024  # of 8000 columns: 32 MB at a time
 
 
 def match_descriptors(source: Keypoints, reference: Keypoints) -> Matches:

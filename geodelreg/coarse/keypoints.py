@@ -17,11 +17,13 @@ from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, IntArra
 logger = logging.getLogger(__name__)
 
 OCTAVE_LAYERS = 3
-DESCRIPTOR_LENGTH = 128
-ROOT_DESCRIPTOR_NORM = 512.0
-_TILE_PX = 640
-_MARGIN_PX = 128
-_OCTAVES_PX = 64
+DESCRIPTOR_LENGTH = 128  # 4 × 4 cells of 8 directions, as Lowe has it
+ROOT_DESCRIPTOR_NORM = 512.0  # OpenCV's norm of a plain descriptor
+_TILE_PX = 640  # unexplained: ablate
+_MARGIN_PX = 128  # unexplained: ablate
+_FIELDS = 5  # of a keypoint: column, row, size, angle, response
+_MASK_SIZE = 5  # of OpenCV's distance transform: precise to 2 %
+_OCTAVES_PX = 64  # 2⁶: a start divisible by it is that of a pixel in the first six octaves
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +156,7 @@ def _detect_in_tile(sift: cv2.SIFT, image: NDArray[np.uint8], tile: _Tile) -> li
 def _table(found: Sequence[cv2.KeyPoint]) -> FloatArray:
     """(N, 5) position (pixel centres), size, angle and response."""
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], dtype=np.float64)
-    return table.reshape(-1, 5)
+    return table.reshape(-1, _FIELDS)
 
 
 def no_keypoints() -> Keypoints:
@@ -172,7 +174,7 @@ def no_keypoints() -> Keypoints:
 def _away_from_invalid(table: FloatArray, valid: BoolArray, margin: float) -> BoolArray:
     if valid.all():
         return np.ones(len(table), dtype=np.bool_)
-    distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, 5)
+    distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, _MASK_SIZE)
     column = np.clip(np.rint(table[:, 0]).astype(np.intp), 0, valid.shape[1] - 1)
     row = np.clip(np.rint(table[:, 1]).astype(np.intp), 0, valid.shape[0] - 1)
     return np.asarray(distance[row, column] > margin * table[:, 2] + 1.0)
@@ -206,7 +208,7 @@ def _describe(
     """Describe the chosen ones, numbered through all tiles, in their order."""
     if not len(chosen):
         return no_keypoints()
-    table = np.empty((len(chosen), 5))
+    table = np.empty((len(chosen), _FIELDS))
     descriptors = np.empty((len(chosen), DESCRIPTOR_LENGTH), dtype=np.float32)
     first = 0
     for tile, points in found:

@@ -12,10 +12,11 @@ from geodelreg.pair import Pair
 from geodelreg.values.guess import Overview, Scope
 from geodelreg.values.raster import Window
 
-_FIRST_BUDGET_PX = 250_000
-_SECOND_BUDGET_PX = 1_600_000
-_FIRST_KEYPOINTS = 1500
-_SECOND_KEYPOINTS = 8000
+_FIRST_BUDGET_PX = 250_000  # 500²; unexplained: ablate
+_SECOND_BUDGET_PX = 1_600_000  # 1265²; unexplained: ablate
+_FIRST_KEYPOINTS = 1500  # unexplained: ablate
+_FINER = 1.01  # times finer; less is rounding to whole pixels
+_SECOND_KEYPOINTS = 8000  # unexplained: ablate
 
 
 def scopes(pair: Pair) -> Iterator[Scope]:
@@ -26,7 +27,7 @@ def scopes(pair: Pair) -> Iterator[Scope]:
     if windows is not None:
         first = Scope(*windows, _FIRST_BUDGET_PX, _FIRST_KEYPOINTS, "header overlap")
         yield first
-        if working_gsd_m(pair, first) > 1.01 * max(*pair.source_gsd_m, *pair.reference_gsd_m):
+        if working_gsd_m(pair, first) > _FINER * max(*pair.source_gsd_m, *pair.reference_gsd_m):
             yield Scope(*windows, _SECOND_BUDGET_PX, _SECOND_KEYPOINTS, "header overlap, finer")
     if windows != whole:
         name = "both rasters whole"

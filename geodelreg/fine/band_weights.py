@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from geodelreg.values.raster import Float32Array, FloatArray
+from geodelreg.values.raster import MAD_TO_SIGMA, TINY, Float32Array, FloatArray
 
-_ROUNDS = 12
+_ROUNDS = 12  # half of least absolute deviations, half of the biweight; unexplained: ablate
 _TUKEY = 3.0
 _LEVERAGE = 3.0
-_CLEARLY = 0.7
-MAD_TO_SIGMA = 1.4826
+_CLEARLY = 0.7  # of the spread; unexplained: ablate
+_RIDGE = 1e-9  # of the mean power: nothing beside rounding of samples in float32
+_CLOSE = 1e-9  # relative to the largest moment: 0 within rounding
+_GONE = 1e-12  # relative to the largest weight: 0 within rounding
+_FLOOR = 1e-3  # of the target's spread; unexplained: ablate
+_LEAST_TRUST = 16.0  # samples' worth; unexplained: ablate
 
 
 def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
@@ -27,14 +31,14 @@ def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
     """
     count = len(moment)
     weights, passive = np.zeros(count), np.zeros(count, dtype=bool)
-    ridge = gram + np.eye(count) * 1e-9 * max(float(np.trace(gram)), 1e-30) / count
+    ridge = gram + np.eye(count) * _RIDGE * max(float(np.trace(gram)), TINY) / count
     unbounded = np.asarray(np.linalg.solve(ridge, moment), dtype=np.float64)
     if (unbounded > 0).all():
         return unbounded
     for _ in range(3 * count):
         slope = np.where(passive, -np.inf, moment - ridge @ weights)
         best = int(np.argmax(slope))
-        if slope[best] <= 1e-9 * float(np.abs(moment).max() + 1e-30):
+        if slope[best] <= _CLOSE * float(np.abs(moment).max() + TINY):
             break
         passive[best] = True
         while passive.any():
@@ -44,9 +48,9 @@ def non_negative_weights(gram: FloatArray, moment: FloatArray) -> FloatArray:
             if not below.any():
                 weights = trial
                 break
-            step = np.min(weights[below] / np.maximum(weights[below] - trial[below], 1e-30))
+            step = np.min(weights[below] / np.maximum(weights[below] - trial[below], TINY))
             weights = weights + step * (trial - weights)
-            passive &= weights > 1e-12 * max(float(weights.max()), 1e-30)
+            passive &= weights > _GONE * max(float(weights.max()), TINY)
             weights[~passive] = 0.0
     return weights
 
@@ -91,11 +95,11 @@ def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatA
     """Weights, correlation and robust spread of the residuals, from a first trust in pixels."""
     rows = np.vstack([x, y])
     rows -= rows.mean(axis=1, keepdims=True)
-    floor = 1e-3 * float(rows[-1].std()) + 1e-30
+    floor = _FLOOR * float(rows[-1].std()) + TINY
     trust = start
     weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
     for round_number in range(_ROUNDS):
-        total = max(float(trust.sum()), 1e-30)
+        total = max(float(trust.sum()), TINY)
         trusted = rows * trust
         mean = trusted.sum(axis=1) / total
         # einsum, for BLAS would wake its threads for products as thin as these
@@ -113,7 +117,7 @@ def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatA
             scale = MAD_TO_SIGMA * float(np.median(residual))
             continue
         scale = min(scale, MAD_TO_SIGMA * float(np.median(residual)))
-        trust = np.clip(1 - (residual / (_TUKEY * scale + 1e-30)) ** 2, 0, None) ** 2
-        if trust.sum() < 16:
+        trust = np.clip(1 - (residual / (_TUKEY * scale + TINY)) ** 2, 0, None) ** 2
+        if trust.sum() < _LEAST_TRUST:
             break
     return weights, correlation, scale

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from geodelreg.fine.least_squares import Matched
+from geodelreg.fine.least_squares import MIN_CORRELATION, Matched
 from geodelreg.fit.delaunay_mesh import star_filter
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit
 from geodelreg.fit.models import Frame
 from geodelreg.fit.rigid_core import rigid_core
 from geodelreg.geo.maps.affine import AffineMap
-from geodelreg.pair import Pair
+from geodelreg.pair import LATTICE, Pair
 from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status, TiePoints
@@ -32,39 +32,41 @@ ELSEWHERE = (Status.CONSENSUS, Status.STAR, Status.RESIDUAL)
 LOCAL_RMS_PX = 0.3
 """Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
 
-_GREYS = 256
-_GROWTH_PX = 5
-_SEPARATION = 3.5
-_LEAST_SPREAD = 1e-4
+_GREYS = 256  # bins of the histogram, as in an image of 8 bit
+_RANGE_PERCENT = (0.5, 99.5)  # outliers in half a percent; unexplained: ablate
+_LEAST_VALUES = 256  # one to a bin
+_LEAST_BRIGHT, _MOST_BRIGHT = 0.01, 0.9  # share of the image; unexplained: ablate
+_GROWTH_PX = 5  # unexplained: ablate
+_SEPARATION = 3.5  # standard deviations of the dark class; unexplained: ablate
+_LEAST_SPREAD = 1e-4  # of the value: beyond the rounding of float32, whose digits are 6e-8
 
-_CALM_MATCHES = 0.8
-_CONTRADICTION_PX = 1.5
+_CALM_MATCHES = 0.8  # unexplained: ablate
+_CONTRADICTION_PX = 1.5  # of the overview; unexplained: ablate
 
-_MIXED_SIGMA = 0.03
+_MIXED_SIGMA = 0.03  # of a patch pixel; unexplained: ablate
 
-_CALM_PATCHES = 0.9
-_CALM_SIGMA_PX = 0.02
+_CALM_PATCHES = 0.9  # unexplained: ablate
+_CALM_SIGMA_PX = 0.02  # unexplained: ablate
 _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 _CONTRADICTION_SIGMAS = 4.0
-_CONTRADICTION_FLOOR_PX = 0.05
+_CONTRADICTION_FLOOR_PX = 0.05  # of MS; unexplained: ablate
 _RELIEF_SIGMAS = 2.0
-_CLEARLY = 0.8
+CLEARLY = 0.8  # of the standard error; unexplained: ablate
 
-_RIVAL_TOLERANCE = 0.2
+_RIVAL_TOLERANCE = 0.2  # of a patch pixel; unexplained: ablate
 _RIVAL_SIGMA = 0.5
-_RIVAL_SCORE = 0.5
 _BAND_SHARE = 0.5
 _SURE_SIGMAS = 3.0
-SURE_LOG_NFA = -12.0
-_MANY_ELSEWHERE = 0.3
+SURE_LOG_NFA = -12.0  # as sure as 40 bits; unexplained: ablate
+_MANY_ELSEWHERE = 0.3  # share of the patches that matched; unexplained: ablate
 
 
 def bright_threshold(band: Band) -> float | None:
     """Value that splits off a clearly separate bright class (Otsu 1979); None without one."""
     values = band.data[band.valid]
-    if len(values) < 256:
+    if len(values) < _LEAST_VALUES:
         return None
-    low, high = np.percentile(values, [0.5, 99.5])
+    low, high = np.percentile(values, _RANGE_PERCENT)
     if not high - low > _LEAST_SPREAD * max(abs(low), abs(high)):
         return None
     inside = values[(values >= low) & (values <= high)]
@@ -75,7 +77,7 @@ def bright_threshold(band: Band) -> float | None:
     bright = float((inside > threshold).mean())
     dark = values[values <= threshold]
     apart = float(values[values > threshold].mean() - dark.mean()) if 0 < bright < 1 else 0.0
-    if not 0.01 < bright < 0.9 or apart < _SEPARATION * float(dark.std()):
+    if not _LEAST_BRIGHT < bright < _MOST_BRIGHT or apart < _SEPARATION * float(dark.std()):
         return None
     return threshold
 
@@ -221,7 +223,7 @@ def difference(pair: Pair, one: Pass, other: Pass) -> tuple[float, tuple[float, 
     """Largest distance over the MS raster of two estimates, and the mean standard error of each."""
     assert one.estimate is not None
     assert other.estimate is not None
-    where = pair.source_lattice(5)
+    where = pair.source_lattice(LATTICE)
     gap = one.estimate.map.forward(where) - other.estimate.map.forward(where)
     sigma = [float(e.map.sigma_at(where).mean()) for e in (one.estimate, other.estimate)]
     return float(np.hypot(*gap.T).max()), (sigma[0], sigma[1])
@@ -256,7 +258,7 @@ def ground_alone(pair: Pair, ground: Pass, everything: Pass) -> bool:
     if ground.estimate.is_shift != everything.estimate.is_shift:
         return not ground.estimate.is_shift
     sigma = difference(pair, ground, everything)[1]
-    return sigma[0] < _CLEARLY * sigma[1]
+    return sigma[0] < CLEARLY * sigma[1]
 
 
 def on_the_mesh(found: Pass) -> StatusArray:
@@ -294,7 +296,7 @@ def rival_motion(points: TiePoints, unit_px: float) -> float:
     tolerance = _RIVAL_TOLERANCE * unit_px
     with np.errstate(invalid="ignore"):
         away = np.hypot(*points.residual_px.T) > 2 * tolerance
-    rest = points.residual_px[~points.kept & sharp & away & (points.score > _RIVAL_SCORE)]
+    rest = points.residual_px[~points.kept & sharp & away & (points.score > MIN_CORRELATION)]
     kept = int(points.kept.sum())
     if not len(rest) or not kept:
         return 0.0 if kept else float("inf")

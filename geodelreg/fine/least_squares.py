@@ -18,7 +18,7 @@ from geodelreg.fine.surface import Surface, sample_patches
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
-from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, StatusArray
+from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray, StatusArray
 
 ROUGH_STEP = 0.04
 """Tolerance where hundredths of a pixel suffice: the step after such a one is much smaller."""
@@ -26,14 +26,16 @@ MAX_MOVE = 1.5
 """A patch that moves further than this, in template pixels, has not converged."""
 _MAX_STEP = 0.05
 """Nor has one whose last step is above this, in template pixels."""
-_MIN_VALID = 0.6
+MIN_VALID = 0.6
 """Least share of usable pixels in a patch."""
-_MIN_CORRELATION = 0.5
+MIN_CORRELATION = 0.5
 """Least absolute correlation after matching."""
 _MAX_SIGMA = 0.5
 """Largest standard error along the worse axis, in template pixels."""
 _MARGIN = 1
-_TINY = 1e-30
+_ROUNDING = 1e-9  # of the energy: sums of float32 are no better
+_LEAST_DETERMINANT = 1e-6  # of three columns of unit length; unexplained: ablate
+_UNKNOWN_PX2 = 1e6  # a variance that no weight survives
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +134,9 @@ def match_patches(
         active = active[(last[active] >= options.tolerance) & ~lost]
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(_finite(covariance))[:, 1], 0))
     status = np.zeros(count, dtype=np.uint8)
-    status[np.abs(correlation) < _MIN_CORRELATION] = Status.CORRELATION
+    status[np.abs(correlation) < MIN_CORRELATION] = Status.CORRELATION
     status[(last > _MAX_STEP) | (np.abs(move).max(axis=1) > MAX_MOVE)] = Status.CONVERGENCE
-    status[~(spread < _MAX_SIGMA) | (share < _MIN_VALID)] = Status.TEXTURE
+    status[~(spread < _MAX_SIGMA) | (share < MIN_VALID)] = Status.TEXTURE
     linear = local[:, :, :2] * patches.step
     position = local[:, :, 2] + np.einsum("pij,pj->pi", linear, move)
     in_surface = np.einsum("pij,pjk,plk->pil", linear, _finite(covariance), linear)
@@ -203,11 +205,15 @@ def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -
     normal, right, energy = gram[:, :3, :3], gram[:, :3, 3], gram[:, 3, 3]
     inverse, solvable = _inverted(normal)
     solution = np.einsum("pij,pj->pi", inverse, right)
-    solvable &= (total > 12) & (energy > 0) & (solution[:, 0] ** 2 * gram[:, 0, 0] > 1e-9 * energy)
+    solvable &= (
+        (total > 3 * normal.shape[1] + 3)
+        & (energy > 0)
+        & (solution[:, 0] ** 2 * gram[:, 0, 0] > _ROUNDING * energy)
+    )
     gain = np.where(solvable, solution[:, 0], 1.0)
-    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
+    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), _ROUNDING * energy)
     variance = residual / np.maximum(total - 4, 1) / gain**2
-    together = np.sqrt(np.maximum(gram[:, 0, 0], _TINY) * np.maximum(energy, _TINY))
+    together = np.sqrt(np.maximum(gram[:, 0, 0], TINY) * np.maximum(energy, TINY))
     return _step(
         solution[:, 1:] / gain[:, None],
         inverse[:, 1:, 1:] * variance[:, None, None],
@@ -226,11 +232,11 @@ def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _
     inverse, solvable = _inverted(normal)
     solution = np.einsum("pij,pj->pi", inverse, right)
     solvable &= (total > 3 * normal.shape[1]) & (energy > 0)
-    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), 1e-9 * energy)
+    residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), _ROUNDING * energy)
     variance = residual / np.maximum(total - normal.shape[1] - 1, 1)
     by_bands, fine = _inverted(normal[:, 2:, 2:])
     explained = np.einsum("pi,pij,pj->p", right[:, 2:], by_bands, right[:, 2:])
-    correlation = np.sqrt(np.clip(explained / np.maximum(energy, _TINY), 0, 1))
+    correlation = np.sqrt(np.clip(explained / np.maximum(energy, TINY), 0, 1))
     return _step(
         -solution[:, :2], inverse[:, :2, :2] * variance[:, None, None], correlation, share,
         solvable & fine,
@@ -240,10 +246,10 @@ def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _
 def _inverted(normal: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Inverses of (P, k, k) normal matrices, and where they exist."""
     count = normal.shape[1]
-    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), _TINY))
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", normal), TINY))
     outer = scale[:, :, None] * scale[:, None, :]
-    scaled = normal / outer + np.eye(count) * 1e-9
-    solvable = np.linalg.det(scaled) > 1e-6 ** (count / 3)
+    scaled = normal / outer + np.eye(count) * _ROUNDING
+    solvable = np.linalg.det(scaled) > _LEAST_DETERMINANT ** (count / 3)
     scaled[~solvable] = np.eye(count)
     return np.linalg.inv(scaled) / outer, solvable
 
@@ -264,7 +270,7 @@ def _step(
 
 def _finite(covariance: FloatArray) -> FloatArray:
     good = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    return np.where(good[:, None, None], covariance, np.eye(2) * 1e6)
+    return np.where(good[:, None, None], covariance, np.eye(2) * _UNKNOWN_PX2)
 
 
 def _offsets(size: int) -> FloatArray:

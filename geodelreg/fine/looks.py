@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodelreg.fine.layers import Pass, difference
+from geodelreg.fine.layers import CLEARLY, Pass, difference
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.matching import match_pass
 from geodelreg.fine.tiles import Tile
@@ -17,9 +17,8 @@ from geodelreg.pair import Roles
 from geodelreg.values.raster import Band
 
 _VISIBLE_BANDS = 3
-_CLEARLY = 0.8
-_MOVE_PX = 0.1
-_SHARPER_SHARE = 0.6
+_MOVE_PX = 0.1  # of MS; unexplained: ablate
+_SHARPER_SHARE = 0.6  # unexplained: ablate
 
 
 class Look(NamedTuple):
@@ -31,7 +30,7 @@ class Look(NamedTuple):
 
 PLAIN = Look(0.0, False)
 HAZE = Look(1.0, False)
-SHARPER = (Look(1.5, True), Look(1.0, True))
+SHARPER = (Look(1.5, True), Look(1.0, True))  # unexplained: ablate
 
 
 def band_looks(bands: list[Band]) -> Iterator[Band]:
@@ -80,7 +79,7 @@ def sharpest(
         local = look.local_tone and part.ms_is_template
         other = replace(tuning, high_pass=look.high_pass, local_tone=local)
         found = match_pass(part, tiles, best.estimate.map, other, options)
-        if not _is_sharper(part, found, best, 1.0 if changed else _CLEARLY):
+        if not _is_sharper(part, found, best, 1.0 if changed else CLEARLY):
             break
         haze = plain[0].high_pass and not plain[0].local_tone
         if haze and difference(part.pair, found, best)[0] > _MOVE_PX:

@@ -23,10 +23,10 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import StatusArray
 
-_GROUP_PATCHES = 100
-_BAND_PATCHES = 100
-_BANDS = 6
-_BAND_TILES = 8
+_GROUP_PATCHES = 100  # unexplained: ablate
+_BAND_PATCHES = 100  # or a few more: the band's sigma is a tenth of a patch's
+_BANDS = 6  # evenly spread; unexplained: ablate
+_BAND_TILES = 8  # evenly spread; unexplained: ablate
 
 
 def match_pass(

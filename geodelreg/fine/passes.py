@@ -28,18 +28,18 @@ from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
 
-COARSE_SIGMA = 0.35
+COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
 _PASSES_FROM_AFAR = 3
 _SOME_TILES = 2
-_MANY_TILES = 5
-_LAST_TOLERANCE = 0.005
-_LAST_ITERATIONS = 5
-_FEWER_SAMPLES = 4_000
+_MANY_TILES = 5  # unexplained: ablate
+_LAST_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
+_LAST_ITERATIONS = 5  # unexplained: ablate
+_FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
 _NEAR_HEADER_PX = 4.0
-_COARSE_FROM = 1.5
-_MUCH_VISIBLE = 0.75
-_BLURRED_SIGMA = 0.85
+_COARSE_FROM = 1.5  # times coarser than full resolution; unexplained: ablate
+_MUCH_VISIBLE = 0.75  # unexplained: ablate
+_BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.sharpness` that is not usual
 
 
 @dataclass(frozen=True, slots=True, eq=False)

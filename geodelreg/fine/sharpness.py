@@ -10,18 +10,20 @@ import numpy as np
 from geodelreg.fine.layers import Pass
 from geodelreg.fine.surface import sample
 from geodelreg.fine.tiles import Tile
-from geodelreg.fine.tuning import Tuning, lattice, tile_images
+from geodelreg.fine.tuning import LEAST_SAMPLES, Tuning, lattice, tile_images
 from geodelreg.geo.affine import apply_affine
 from geodelreg.pair import Roles
 from geodelreg.values.points import Status
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray
 
 _USUAL = (0.3, 0.4, 0.5, 0.6, 0.7)
+"""Of a pixel: Gaussian point spreads that pass 0.64 to 0.09 of the contrast at Nyquist."""
 _SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is out of focus
-_CLEARLY = 0.9
+_CLEARLY = 0.9  # of what is unlike; unexplained: ablate
 _MUCH_UNLIKE = 0.5
-_PIXELS = 300_000
-_SAMPLES = 8_000
+_PIXELS = 300_000  # of the finer image; unexplained: ablate
+_LEAST_SAMPLES = 32  # unexplained: ablate
+_SAMPLES = 8_000  # correlations are then known to 0.01
 
 
 def fit_sigma(part: Roles, tiles: list[Tile], near: Pass, tuning: Tuning, size: int) -> float:
@@ -34,7 +36,7 @@ def fit_sigma(part: Roles, tiles: list[Tile], near: Pass, tuning: Tuning, size: 
     agreed = near.matched.template_px[near.status == Status.KEPT]
     count = max(_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
-    per_tile = max(_SAMPLES // len(chosen), 64)
+    per_tile = max(_SAMPLES // len(chosen), LEAST_SAMPLES)
     lattices = [lattice(tile.template[0], part, per_tile) for tile in chosen]
     covered = [_covered(part, tile.template[0], agreed, size) for tile in chosen]
 
@@ -90,6 +92,6 @@ def lowest(values: dict[float, float]) -> float:
 
 
 def _unexplained(one: Float32Array, other: Float32Array) -> float:
-    if len(one) < 32 or not (one.std() > 0 and other.std() > 0):
+    if len(one) < _LEAST_SAMPLES or not (one.std() > 0 and other.std() > 0):
         return 1.0
     return 1.0 - float(np.corrcoef(one, other)[0, 1]) ** 2

@@ -20,11 +20,13 @@ from geodelreg.geo.pixel import corner_to_centre
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Grid, IntArray
 
 _POLE = np.sqrt(3.0) - 2.0
-_PREFILTER_RADIUS = 8
+_PREFILTER_RADIUS = 8  # where the filter of pole 0.27 has decayed to 3e-5
 SPLINE_REACH_PX = _PREFILTER_RADIUS + 4
-_VALID_SHARE = 0.999
-_GAUSSIAN_REACH = 3.5
-_NO_BLUR_PX = 0.05
+_VALID_SHARE = 0.999  # of the low-pass's weight; the rest is rounding
+_GAUSSIAN_REACH = 3.5  # standard deviations: 5e-4 of the weight lie beyond
+_LEAST_SHARE = 1e-3  # of weight: means of less are not used
+_SIXTHS = 6  # over the weights of a cubic B-spline: 1, 4 and 1 sixths at the knots
+_NO_BLUR_PX = 0.05  # whose taps would be 1 and nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +57,7 @@ def window_matrix(full: Grid, part: Grid) -> FloatArray:
 
 def _spline_prefilter() -> FloatArray:
     k = np.abs(np.arange(-_PREFILTER_RADIUS, _PREFILTER_RADIUS + 1))
-    taps = -6.0 * _POLE / (1.0 - _POLE**2) * _POLE**k
+    taps = -float(_SIXTHS) * _POLE / (1.0 - _POLE**2) * _POLE**k
     return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 
@@ -127,7 +129,7 @@ def high_pass(band: Band, sigma_px: float) -> Band:
     level = np.float32(band.data[band.valid].mean()) if band.valid.any() else np.float32(0)
     centred = (band.data - level) * valid
     weight = cv2.GaussianBlur(valid, (0, 0), sigma_px)
-    mean = cv2.GaussianBlur(centred, (0, 0), sigma_px) / np.maximum(weight, 1e-3)
+    mean = cv2.GaussianBlur(centred, (0, 0), sigma_px) / np.maximum(weight, _LEAST_SHARE)
     return replace(band, data=np.asarray(centred - mean, dtype=np.float32))
 
 
@@ -141,7 +143,7 @@ def _fill(band: Band, taps: list[FloatArray]) -> tuple[Float32Array, BoolArray]:
     mean = np.float32(band.data[band.valid].mean()) if band.valid.any() else np.float32(0)
     centred = np.where(band.valid, band.data - mean, np.float32(0))
     box = (len(taps[0]) + 4, len(taps[1]) + 4)
-    local = cv2.blur(centred, box) / np.maximum(cv2.blur(valid, box), np.float32(1e-3))
+    local = cv2.blur(centred, box) / np.maximum(cv2.blur(valid, box), np.float32(_LEAST_SHARE))
     filled = np.where(band.valid, centred, local) + mean
     near = cv2.sepFilter2D(valid, cv2.CV_32F, taps[0], taps[1])
     return filled.astype(np.float32), np.asarray(near > _VALID_SHARE)
@@ -263,8 +265,8 @@ def _two_taps(at: Float32Array) -> tuple[Float32Array, Float32Array, Float32Arra
     f = at - base
     square = f * f
     # six times the weights of the first two and the last two of the four spline coefficients
-    low = ((2 * f - 3) * f - 3) * f + 5
-    high = 6 - low
-    first = base - 1 + ((3 * f - 6) * square + 4) / low
+    low = _SIXTHS - 1 + ((2 * f - 3) * f - 3) * f
+    high = _SIXTHS - low
+    first = base - 1 + ((3 * f - _SIXTHS) * square + 4) / low
     second = base + 1 + square * f / high
-    return first, second, low / np.float32(6)
+    return first, second, low / np.float32(_SIXTHS)

@@ -15,15 +15,16 @@ from geodelreg.values.guess import Guess, Overview
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, BoolArray, Grid, Window
 
-PATCH_PX = 20
+PATCH_PX = 20  # square; unexplained: ablate
 _SPREAD_TILE_PATCHES = 4
 _SPREAD_TILE_PATCHES_FINE = 3
-_FINE_RATIO = 2.5
-_ADJOINING_TILE_PATCHES = 8
+_FINE_RATIO = 2.5  # unexplained: ablate
+_ADJOINING_TILE_PATCHES = 8  # unexplained: ablate
 _MEMO = 1
-SMALLEST_PATCH_PX = 12
-_WANTED_PATCHES = 40
-_MOST_TILES_PER_AXIS = 7
+SMALLEST_PATCH_PX = 12  # square; unexplained: ablate
+_WANTED_PATCHES = 40  # five times what the gate asks; unexplained: ablate
+_MOST_TILES_PER_AXIS = 7  # unexplained: ablate
+_USUAL_SIGMA = 0.7  # of a template pixel, the largest point spread that is usual
 _LOW_PASS_REACH = 4.0
 _SLACK_PX = 3.0
 
@@ -110,7 +111,7 @@ def read_tile(part: Roles, window: Window, correction: PixelMap) -> Tile | None:
     if not np.isfinite(place).all():
         return None
     ratio = part.surface_px_per_patch_px
-    margin = (0.7 * _LOW_PASS_REACH + _SLACK_PX) * ratio + SPLINE_REACH_PX
+    margin = (_USUAL_SIGMA * _LOW_PASS_REACH + _SLACK_PX) * ratio + SPLINE_REACH_PX
     around = window_around(place, margin, part.surface.grid)
     if around is None:
         return None

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fine.band_weights import MAD_TO_SIGMA, robust_band_weights
-from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray
+from geodelreg.fine.band_weights import robust_band_weights
+from geodelreg.values.raster import MAD_TO_SIGMA, TINY, Band, BoolArray, Float32Array, FloatArray
 
-_SLICE = 512
+_SLICE = 512  # rows at a time; unexplained: ablate
 _TUKEY_WIDE = 4.0
-_MAX_CURVED_BANDS = 6
+_MAX_CURVED_BANDS = 6  # they have 21 products; unexplained: ablate
 _WORTHWHILE = 0.97
-_MOST_FALLING = 0.2
+"""Of the spread: three percent of it are worth the curvature; unexplained: ablate."""
+_RANGE_PERCENT = (0.2, 99.8)  # unexplained: ablate
+_TUKEY_ROUNDS = 6  # unexplained: ablate
+_RIDGE = 1e-6  # a sample, of standardised products: nothing beside their noise
+_MOST_FALLING = 0.2  # unexplained: ablate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +110,8 @@ def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan
     if not weights.any():
         return None
     stack = bands.astype(np.float64)
-    low, high = np.percentile(stack, [0.2, 99.8], axis=1)
-    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), 1e-30)
+    low, high = np.percentile(stack, _RANGE_PERCENT, axis=1)
+    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), TINY)
     curvature = np.zeros(len(bands) * (len(bands) + 1) // 2)
     if len(bands) <= _MAX_CURVED_BANDS:
         products = np.stack(list(_products(bands, centre, spread, low, high)), axis=1)
@@ -170,10 +174,10 @@ def _robust_spread(values: FloatArray) -> float:
 
 def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least squares by Tukey's biweight from the median absolute residual, a little ridge."""
-    ridge = np.eye(design.shape[1]) * 1e-6 * len(target)
-    trust = np.clip(1 - (target / (_TUKEY_WIDE * _robust_spread(target) + 1e-30)) ** 2, 0, None)
+    ridge = np.eye(design.shape[1]) * _RIDGE * len(target)
+    trust = np.clip(1 - (target / (_TUKEY_WIDE * _robust_spread(target) + TINY)) ** 2, 0, None)
     fitted: FloatArray = np.zeros(design.shape[1])
-    for _ in range(6):
+    for _ in range(_TUKEY_ROUNDS):
         weighted = design * trust[:, None]
         normal = ridge + sum(
             weighted[start : start + _SLICE].T @ design[start : start + _SLICE]
@@ -183,5 +187,5 @@ def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
         fitted = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
         residual = target - np.einsum("nk,k->n", design, fitted)
         scale = _robust_spread(residual)
-        trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + 1e-30)) ** 2, 0, None) ** 2
+        trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + TINY)) ** 2, 0, None) ** 2
     return fitted

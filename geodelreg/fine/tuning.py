@@ -16,8 +16,8 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, Float32Array, FloatArray, Grid
 
 DEFAULT_SIGMA = 0.5
-_TONE_SAMPLES = 8_000
-_LEAST_SAMPLES = 64
+_TONE_SAMPLES = 8_000  # unexplained: ablate
+LEAST_SAMPLES = 64  # unexplained: ablate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ def fit_tone(
     part: Roles, tiles: list[Tile], correction: PixelMap, sigma: float, samples: int = _TONE_SAMPLES
 ) -> SyntheticPan:
     """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
-    there, per_tile = part.to_surface(correction), max(samples // len(tiles), 64)
+    there, per_tile = part.to_surface(correction), max(samples // len(tiles), LEAST_SAMPLES)
 
     def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
         xy, take = lattice(tile.template[0], part, per_tile)
@@ -79,7 +79,7 @@ def fit_tone(
     with ThreadPoolExecutor(part.pair.threads) as pool:
         bands, target = zip(*pool.map(samples_of, tiles), strict=True)
     stacked, goal = np.concatenate(bands, axis=1), np.concatenate(target)
-    fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= _LEAST_SAMPLES else None
+    fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= LEAST_SAMPLES else None
     return fitted or single_band(len(stacked), 0)
 
 

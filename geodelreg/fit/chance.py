@@ -8,7 +8,9 @@ import numpy as np
 
 from geodelreg.values.raster import FloatArray, IntArray
 
+_LN_10 = math.log(10)  # between the bases
 _RESIDUAL_FLOOR_PX = 0.1
+"""Positions are no better, and a residual of 0 would prove everything; unexplained: ablate."""
 
 
 def log_nfa(
@@ -65,7 +67,8 @@ def log10_binomial_tail(successes: int, trials: int, probability: float) -> floa
     odds = math.log10(probability) - math.log10(1.0 - probability)
     terms = _log10_choose(trials, k) + k * odds + trials * math.log10(1.0 - probability)
     most = float(terms.max())
-    return min(most + math.log10(float((10.0 ** (terms - most)).sum())), 0.0)
+    rest = float(np.exp(_LN_10 * (terms - most)).sum())
+    return min(most + math.log10(rest), 0.0)
 
 
 def _log10_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:

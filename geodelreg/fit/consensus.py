@@ -14,18 +14,19 @@ from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 SAMPLE_SIZE = {"similarity": 2, "affine": 3}
 SAMPLES = {"similarity": (2,), "affine": (2, 3)}
-MAX_STRETCH = 8.0
+MAX_STRETCH = 8.0  # unexplained: ablate
 
-_SCORED_MATCHES = 1000
-_SAMPLES_PER_ROUND = 300
-_MAX_ROUNDS = 40
-_REFINED_HYPOTHESES = 12
+_SCORED_MATCHES = 1000  # unexplained: ablate
+_SAMPLES_PER_ROUND = 300  # unexplained: ablate
+_MAX_ROUNDS = 40  # at most 12 000 samples; unexplained: ablate
+_MISSED = 1e-4  # probability that no sample was all inliers
+_REFINED_HYPOTHESES = 12  # unexplained: ablate
 _LOOSENING = (4.0, 2.0, 1.0, 1.0)
-_MAX_PAIRS = 1500
-_CONVINCING_SHARE = 0.3
-_MIN_BASELINE_PX = 16.0
-_LOG_SCALE_TOLERANCE = math.log(1.35)
-_TURN_TOLERANCE = math.radians(15.0)
+_MAX_PAIRS = 1500  # unexplained: ablate
+_CONVINCING_SHARE = 0.3  # unexplained: ablate
+_MIN_BASELINE_PX = 16.0  # unexplained: ablate
+_LOG_SCALE_TOLERANCE = math.log(1.35)  # of SIFT's scales; unexplained: ablate
+_TURN_TOLERANCE = math.radians(15.0)  # of SIFT's orientations; unexplained: ablate
 
 
 class Consensus(NamedTuple):
@@ -296,11 +297,11 @@ def _squared_residuals(
 
 
 def _samples_needed(inliers: float, count: int, size: int) -> int:
-    """Samples after which an all-inlier one has been seen with probability 0.9999."""
+    """Samples after which an all-inlier one has been seen with probability 1 − `_MISSED`."""
     share = min(max(inliers, size) / count, 1.0)
     if share == 1.0:
         return 0
-    return int(math.log(1e-4) / math.log1p(-(share**size))) + 1
+    return int(math.log(_MISSED) / math.log1p(-(share**size))) + 1
 
 
 def _best_of(matrices: FloatArray, scores: FloatArray) -> FloatArray:

@@ -27,13 +27,14 @@ from geodelreg.values.points import Status
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 _MEDIAN = 2 * np.log(2)  # of squared distances over variances, in the plane
-_SURE = 16.0
-_WORTHWHILE_GROWTH = 1.01
+_SURE = 16.0  # times a match's own variance; unexplained: ablate
+_WORTHWHILE_GROWTH = 1.01  # one percent more points
 _MAX_FLIPPED_SHARE = 0.5
-_MAX_ROUNDS = 20
-_ROBUST_FIT_ROUNDS = 12
+_MAX_ROUNDS = 20  # it ends sooner; this is a bound
+_ROBUST_FIT_ROUNDS = 12  # unexplained: ablate
 _MIN_POINTS = 4
-_MIN_SIGMA_PX = 1e-4
+_LEAST_GAP_PX = 1e-3  # so that no point weighs without bound
+_MIN_SIGMA_PX = 1e-4  # below what any image tells
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +288,7 @@ def _robust_affine(source_xy: FloatArray, reference_xy: FloatArray) -> AffineMap
         right = np.einsum("mi,m,mc->ic", basis, weight, reference_xy)
         coefficients = np.linalg.lstsq(normal, right, rcond=None)[0]
         gap = reference_xy - basis @ coefficients
-        weight = 1.0 / np.maximum(np.hypot(gap[:, 0], gap[:, 1]), 1e-3)
+        weight = 1.0 / np.maximum(np.hypot(gap[:, 0], gap[:, 1]), _LEAST_GAP_PX)
     linear = coefficients[:2].T
     offset = coefficients[2] - linear @ source_xy.mean(axis=0)
     return AffineMap.of(np.column_stack([linear, offset]))

@@ -19,7 +19,7 @@ from geodelreg.values.raster import FloatArray
 
 MODEL_ORDER = ("shift", "scale", "similarity", "affine")
 NORTH_UP = ("shift", "scale")
-PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}
+PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}  # see `design`
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatA
         columns[:, 0, 2], columns[:, 1, 3] = x, y
     elif model == "affine":
         columns[:, 0, 2], columns[:, 0, 3] = x, y
-        columns[:, 1, 4], columns[:, 1, 5] = x, y
+        columns[:, 1, 4:] = u
     elif model == "similarity":
         growth, turn = _similarity_generators(frame)
         columns[:, :, 2], columns[:, :, 3] = u @ growth.T, u @ turn.T
@@ -107,7 +107,7 @@ def fitted_map(
     if model == "scale":
         linear = np.diag(1.0 + parameters[2:4])
     elif model == "affine":
-        linear = np.eye(2) + parameters[2:6].reshape(2, 2)
+        linear = np.eye(2) + parameters[2:].reshape(2, 2)
     elif model == "similarity":
         growth, turn = _similarity_generators(frame)
         linear = np.eye(2) + parameters[2] * growth + parameters[3] * turn

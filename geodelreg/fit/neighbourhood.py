@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from geodelreg.geo.triangulation import distinct, neighbours
-from geodelreg.values.raster import FloatArray, IntArray
+from geodelreg.values.raster import TINY, FloatArray, IntArray
 
-_FEW_POINTS = 12
+_FEW_POINTS = 12  # unexplained: ablate
 _FIT_ROUNDS = 2
 _CAUCHY_TUNING = 2.0
 _NEARNESS = 3.0
-_LOWER_QUARTILE = 0.5754
+_QUARTER = 0.25  # more than half of the members may be wrong
+_LOWER_QUARTILE = 0.5754  # of χ²(2): −2 ln 0.75
 
 
 class Field(NamedTuple):
@@ -144,7 +145,7 @@ def predict(targets: FloatArray, star: Star, field: Field, max_strain: float) ->
     offset = field.xy[star.member] - targets[star.target]
     distance2 = (offset * offset).sum(axis=1)
     size = np.maximum(np.bincount(star.target, minlength=count), 1)
-    reach = np.sqrt(np.maximum(np.bincount(star.target, distance2, count) / size, 1e-12))
+    reach = np.sqrt(np.maximum(np.bincount(star.target, distance2, count) / size, TINY))
     basis = np.column_stack([np.ones(len(offset)), offset / reach[star.target, None]])
     values = field.displacement[star.member]
     stated = field.variance[star.member]
@@ -172,7 +173,7 @@ def _usual(misfit: FloatArray) -> float:
     """
     if len(misfit) == 0:
         return 1.0
-    return max(float(np.quantile(misfit, 0.25)) / _LOWER_QUARTILE, 1.0)
+    return max(float(np.quantile(misfit, _QUARTER)) / _LOWER_QUARTILE, 1.0)
 
 
 def _fit_planes(

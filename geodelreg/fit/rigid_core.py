@@ -9,12 +9,13 @@ import numpy as np
 
 from geodelreg.fit.consensus import consensus_affine
 from geodelreg.fit.estimate import Observations
-from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
-_CORE_SIGMAS = 1.5
-_CORE_FLOOR_PX = 0.03
-_SHIFT_SHARE = 0.15
-_AFFINE_SHARE = 0.25
+_CORE_SIGMAS = 1.5  # of the patches' own noise; unexplained: ablate
+_CORE_FLOOR_PX = 0.03  # of a patch pixel; unexplained: ablate
+_GROWTH = 1.5  # of the tolerance from try to try; unexplained: ablate
+_SHIFT_SHARE = 0.15  # unexplained: ablate
+_AFFINE_SHARE = 0.25  # unexplained: ablate
 _CORE_REACH = 2.0
 
 
@@ -35,7 +36,7 @@ def rigid_core(points: Observations, unit: float) -> BoolArray:
             return _core(residuals[0], tolerance, variance)
         if shares[-1] >= _AFFINE_SHARE:
             return _core(residuals[-1], tolerance, variance)
-        tolerance *= 1.5
+        tolerance *= _GROWTH
     return np.ones(len(points), dtype=bool)
 
 
@@ -43,7 +44,7 @@ def _core(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolA
     """Points around 0, if more lie there than of a normal distribution as wide as theirs."""
     radius = np.hypot(*residual.T)
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(residual.T)))
-    fair = math.prod(math.erf(tolerance / (math.sqrt(2) * max(s, 1e-9))) for s in spread)
+    fair = math.prod(math.erf(tolerance / (math.sqrt(2) * max(s, TINY))) for s in spread)
     if (radius <= tolerance).mean() < fair:
         return np.ones(len(radius), dtype=bool)
     return np.asarray(radius**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)

@@ -14,7 +14,10 @@ from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Accuracy
 
-_E1_PIXELS = 40_000
+_E1_PIXELS = 40_000  # an RMSE of so many is known to 0.4 %
+_LEAST_PIXELS = 64  # of fewer nothing is said; unexplained: ablate
+_EDGE_PLACES = 8  # on each edge of a footprint; unexplained: ablate
+_CE_PERCENT = 90  # as CE90 is defined
 
 SYSTEMATIC_PX = 0.0012
 """What no residual shows: aliasing, interpolation and unlike point spreads move all patches alike,
@@ -79,7 +82,11 @@ def _rms(vectors: FloatArray) -> float:
 
 def _ce90(vectors: FloatArray) -> float:
     good = vectors[np.isfinite(vectors).all(axis=1)]
-    return float(np.percentile(np.hypot(good[:, 0], good[:, 1]), 90)) if len(good) else math.nan
+    return (
+        float(np.percentile(np.hypot(good[:, 0], good[:, 1]), _CE_PERCENT))
+        if len(good)
+        else math.nan
+    )
 
 
 def _coverage(part: Roles, points: TiePoints, correction: PixelMap) -> float:
@@ -90,7 +97,7 @@ def _coverage(part: Roles, points: TiePoints, correction: PixelMap) -> float:
     if kept.sum() < 3:
         return 0.0
     spots = points.source_px[kept] if part.ms_is_template else points.reference_px[kept]
-    ring = part.to_surface(correction).inverse(outline(part.surface.grid, 8))
+    ring = part.to_surface(correction).inverse(outline(part.surface.grid, _EDGE_PLACES))
     seen = Polygon(ring).buffer(0)
     rows, columns = part.template.grid.shape
     common = seen.intersection(box(0, 0, columns, rows)).area
@@ -103,7 +110,7 @@ def grey_rmse(overlaid: Overlay, ms_is_template: bool) -> float:
     Zhang, Ma & Zhang 2013, on common valid pixels, of which so many are as good as all.
     """
     good = np.flatnonzero(overlaid.valid)
-    if len(good) < 64:
+    if len(good) < _LEAST_PIXELS:
         return float("nan")
     good = good[:: max(len(good) // _E1_PIXELS, 1)]
     template, surface = overlaid.template.ravel()[good], overlaid.surface.ravel()[good]
@@ -116,7 +123,7 @@ def grey_rmse(overlaid: Overlay, ms_is_template: bool) -> float:
 def correlation(overlaid: Overlay) -> float:
     """Correlation of the two images on common valid pixels."""
     good = overlaid.valid
-    if good.sum() < 64:
+    if good.sum() < _LEAST_PIXELS:
         return float("nan")
     one, other = overlaid.template[good], overlaid.surface[good]
     if one.std() == 0 or other.std() == 0:

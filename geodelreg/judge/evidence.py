@@ -24,9 +24,10 @@ from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair
 from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import TINY
 from geodelreg.values.result import Accuracy
 
-_SURE_LOG_CHANCE = -12.0
+_SURE_LOG_CHANCE = -12.0  # far beyond the gate's −8: all patches would say the same
 
 
 def gather(
@@ -112,4 +113,4 @@ def _turn_and_scale(pair: Pair, correction: PixelMap) -> tuple[float, float]:
     ground = metric @ linear @ np.linalg.inv(metric)
     stretch = np.linalg.svd(ground, compute_uv=False)
     turn = math.degrees(math.atan2(ground[1, 0] - ground[0, 1], ground[0, 0] + ground[1, 1]))
-    return turn, float(max(stretch[0], 1 / max(stretch[1], 1e-9)))
+    return turn, float(max(stretch[0], 1 / max(stretch[1], TINY)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.fine.least_squares import MIN_CORRELATION, MIN_VALID
 from geodelreg.fine.patches import Patches, cut_patches, sample_step
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.fine.tiles import Tile
@@ -16,13 +17,12 @@ from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, IntArray
 
-_DISPLACED_RADII = (4.0, 9.0)
-_DIRECTIONS = 8
-_BY_CHANCE = 0.125
-_TESTED_PATCHES = 160
-_LEAST_SEEN = 0.6
-_LEAST_DISPLACED = 8
-_RESEMBLES = 0.25
+_DISPLACED_RADII = (4.0, 9.0)  # patch pixels: beyond the texture's own width; unexplained: ablate
+_DIRECTIONS = 8  # at each radius: 16 places
+_BY_CHANCE = 0.125  # twice 1/17: the best of 17 like places; unexplained: ablate
+_TESTED_PATCHES = 160  # unexplained: ablate
+_LEAST_DISPLACED = 8  # half of the places
+_RESEMBLES = MIN_CORRELATION**2  # share of the variance that is explained
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ def _explained(
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
     energy = (image**2).sum(axis=(2, 3))
-    good = seen.mean(axis=2) > _LEAST_SEEN
+    good = seen.mean(axis=2) > MIN_VALID
     good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
     return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
 

@@ -11,10 +11,12 @@ from geodelreg.coarse.correlation import detail_pair, masked_correlation
 from geodelreg.fine.overlay import Overlay
 from geodelreg.values.raster import Float32Array, FloatArray
 
-_NEAR_PX = 8
+_NEAR_PX = 8  # unexplained: ablate
 _PEAK_PX = 3
-_RIVALS = 5
-_RIVAL_OVERLAP = 0.2
+_LEAST_COMMON = 1000  # pixels; unexplained: ablate
+_LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
+_RIVALS = 5  # unexplained: ablate
+_RIVAL_OVERLAP = 0.2  # unexplained: ablate
 _BLOCK_PX = 32  # of the image magnified twice
 _UNSUSPICIOUS = 0.5
 
@@ -35,7 +37,7 @@ def rival_correlation(overlay: Overlay) -> float:
     height, width = one.shape
     small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
     common = float((one_mask * other_mask).sum())
-    if small or common < 1000:
+    if small or common < _LEAST_COMMON:
         return float("nan")
     signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
     scores = np.abs(signed)
@@ -91,7 +93,7 @@ def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int,
     second = other[max(dy, 0) : min(height + dy, height), max(dx, 0) : min(width + dx, width)]
     a, b = _blocks(first), _blocks(second)
     power = (a**2).sum(axis=1) * (b**2).sum(axis=1)
-    textured = power > 1e-6
+    textured = power > _LEAST_POWER
     if not textured.any():
         return float("nan")
     return float(np.sqrt(((a * b).sum(axis=1)[textured] ** 2 / power[textured]).mean()))

@@ -13,18 +13,18 @@ from geodelreg.options import AlignOptions
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
 
-MIN_POINTS = 8
+MIN_POINTS = 8  # unexplained: ablate
 MAX_LOG_EACH = -2.0
-MAX_LOG_TOGETHER = -8.0
-MAX_SIGMA_PX = 0.7
-MIN_COVERAGE = 0.05
+MAX_LOG_TOGETHER = -8.0  # unexplained: ablate
+MAX_SIGMA_PX = 0.7  # unexplained: ablate
+MIN_COVERAGE = 0.05  # unexplained: ablate
 MAX_DISAGREEMENT_PX = 1.0
-MAX_RIVAL = 0.85
-MAX_RIVAL_MOTION = 0.67
+MAX_RIVAL = 0.85  # unexplained: ablate
+MAX_RIVAL_MOTION = 0.67  # two thirds; unexplained: ablate
 MIN_SUPPORT = 0.5
 MAX_BANDS_APART = 0.5
 MAX_KEYPOINTS_APART = 2.0
-SYSTEMATIC_PX = 0.005
+SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
 SIGNIFICANCE = 3.0
 
 

@@ -11,6 +11,7 @@ from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray
 
 _LOCAL_SIGNIFICANCE = 3.0
+_MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
 
@@ -81,7 +82,7 @@ def local_distortion(points: TiePoints) -> float:
         members: FloatArray = residual[block == number]
         if len(members) >= _LEAST_PER_BLOCK:
             means.append(np.median(members, axis=0))
-            noise.append(1.57 * members.var(axis=0, ddof=1) / len(members))
+            noise.append(_MEDIAN_VARIANCE * members.var(axis=0, ddof=1) / len(members))
     if len(means) < _BLOCKS:
         return float("nan")
     excess = np.mean(np.square(means), axis=0) - np.mean(noise, axis=0)

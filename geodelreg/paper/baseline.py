@@ -20,8 +20,10 @@ from geodelreg.pair import Pair, overlap_corners, roles
 from geodelreg.paper.zhang2013 import ZhangOptions, match_sift, match_zhang2013
 from geodelreg.values.guess import Guess, Overview
 from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import TINY
 
 _SIFT_SCATTER_PX = 0.3
+"""Of the images, per axis; as `geodelreg.paper.zhang2013.ZhangOptions` has it."""
 
 
 def find_by_keypoints(pair: Pair, guess: Guess) -> tuple[Guess, Refinement, Fitted] | None:
@@ -81,7 +83,7 @@ def least_squares(model: str, points: Observations, frame: Frame) -> Estimate:
     spare = max(residual.size - len(parameters), 1)
     variance = float((residual**2).sum()) / spare
     everyone = np.ones(len(points), dtype=bool)
-    distance2 = (residual**2).sum(axis=1) / max(variance, 1e-30)
+    distance2 = (residual**2).sum(axis=1) / max(variance, TINY)
     spread = np.asarray(np.linalg.pinv(normal, hermitian=True) * variance, dtype=np.float64)
     there = fitted_map(model, parameters, frame, spread)
     return Estimate(model, there, parameters, spread, frame, variance, everyone, distance2)

@@ -22,6 +22,11 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 StatusArray = NDArray[np.uint8]
 
+TINY = 1e-30
+"""Keeps quotients finite: below the square of any pixel's value, above the least float64."""
+MAD_TO_SIGMA = 1.4826
+"""Median absolute deviation of a normal distribution to its sigma: 1 / 0.6745."""
+
 
 class Window(NamedTuple):
     """A rectangle of whole pixels: offsets of its upper-left corner, then its size."""
