@@ -184,7 +184,7 @@ def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
         image, valid = to_uint8(band), band.valid
     except NoDataError:
         return no_keypoints()
-    options = KeypointOptions(max_keypoints=min(scope.keypoints, pair.options.max_keypoints))
+    options = KeypointOptions(max_keypoints=scope.keypoints)
     if not flip:
         return detect(image, valid, options)
     return detect(np.ascontiguousarray(image[::-1]), np.ascontiguousarray(valid[::-1]), options)

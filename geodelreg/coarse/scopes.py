@@ -14,24 +14,25 @@ from geodelreg.values.raster import Window
 
 _FIRST_BUDGET_PX = 250_000  # 500²; unexplained: ablate
 _SECOND_BUDGET_PX = 1_600_000  # 1265²; unexplained: ablate
-_FIRST_KEYPOINTS = 1500  # unexplained: ablate
+_FIRST_KEYPOINTS = 1500  # of each image, and a quarter of what is asked for; unexplained: ablate
 _FINER = 1.01  # times finer; less is rounding to whole pixels
-_SECOND_KEYPOINTS = 8000  # unexplained: ablate
 
 
 def scopes(pair: Pair) -> Iterator[Scope]:
     """The header overlap grown by the search radius, the same finer, then both rasters whole."""
     source, reference = pair.source.grid, pair.reference.grid
+    most = pair.options.max_keypoints
+    few = max(min(most, _FIRST_KEYPOINTS), most // 4)
     windows = overlap_windows(source, reference, pair.options.search_radius_px, map_points)
     whole = tuple(Window(0, 0, grid.shape[1], grid.shape[0]) for grid in (source, reference))
     if windows is not None:
-        first = Scope(*windows, _FIRST_BUDGET_PX, _FIRST_KEYPOINTS, "header overlap")
+        first = Scope(*windows, _FIRST_BUDGET_PX, few, "header overlap")
         yield first
         if working_gsd_m(pair, first) > _FINER * max(*pair.source_gsd_m, *pair.reference_gsd_m):
-            yield Scope(*windows, _SECOND_BUDGET_PX, _SECOND_KEYPOINTS, "header overlap, finer")
+            yield Scope(*windows, _SECOND_BUDGET_PX, most, "header overlap, finer")
     if windows != whole:
         name = "both rasters whole"
-        yield Scope(whole[0], whole[1], _SECOND_BUDGET_PX, _SECOND_KEYPOINTS, name, is_whole=True)
+        yield Scope(whole[0], whole[1], _SECOND_BUDGET_PX, most, name, is_whole=True)
 
 
 def working_gsd_m(pair: Pair, scope: Scope) -> float:

@@ -126,11 +126,6 @@ class RasterReader:
         """Says so when one block is too large for a file to be read in pieces; else empty."""
         return "; ".join(file.block_note for file in self._files if file.block_note)
 
-    @property
-    def is_single_block(self) -> bool:
-        """True when windows cannot be read in pieces."""
-        return bool(self.block_note)
-
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
     ) -> list[Band]:

@@ -28,6 +28,12 @@ SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
 SIGNIFICANCE = 3.0
 
 
+_APART_FROM = {
+    True: "PAN px between the corrections of two halves of the tie points",
+    False: "PAN px between the correction and the patches around it",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """What speaks for and against a correction.  ``_px`` are PAN pixels; NaN = not measured.
@@ -46,7 +52,8 @@ class Evidence:
     sigma_px : float
         Standard error of the correction at the worst corner of the overlap.
     disagreement_px : float
-        Median distance between the correction and area correlation that started from it.
+        Half the distance between fits to two halves of the tie points at the worst corner of the
+        overlap; of other methods than ours, that from what dense patches around it say.
     rival : float
         Correlation at the best displaced place over that at the correction; near 1 = ambiguous.
     shift_px, rotation_deg, scale : float
@@ -111,7 +118,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
             "disagreement_px",
             evidence.disagreement_px,
             MAX_DISAGREEMENT_PX,
-            "PAN px between the correction and area correlation",
+            _APART_FROM[options.method == "delaunay"],
         ),
         _at_most(
             "rival", evidence.rival, MAX_RIVAL, "relative correlation of the best rival place"

@@ -28,10 +28,8 @@ _FORMATS = (".png", ".svg", ".pdf")
 _KEPT = "#ffcf33"
 _MESH = "#35d0ff"
 _REJECTED = "#ff4d4d"
-_INK = "#1f4e79"
 _ACCENT = "#d1495b"
 _LINES_AT_MOST = 40
-_ARROWS_AT_MOST = 1200
 _TILES = 6
 _MIDDLE_GREY = 0.42
 _STYLE: Any = {
@@ -193,103 +191,6 @@ def _spread(xy: FloatArray, indices: IntArray, count: int) -> IntArray:
         distance = np.minimum(distance, np.hypot(*(places - places[chosen[-1]]).T))
         chosen.append(int(np.argmax(distance)))
     return indices[chosen]
-
-
-def draw_residuals(alignment: Alignment, path: str | Path, *, overwrite: bool = False) -> None:
-    """Where the tie points' residuals point to, and how they are distributed.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        Kept tie points with known residuals are drawn, where they lie in MS, as arrows from the
-        PAN position to the corrected MS position, along PAN's columns and rows.
-    path : str or Path
-    overwrite : bool
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
-    points = alignment.tie_points
-    known = points.kept & np.isfinite(points.residual_px).all(axis=1)
-    xy, residual = points.source_px[known], points.residual_px[known]
-    lengths = np.hypot(*residual.T)
-    ce90 = alignment.accuracy.check_ce90_px
-    if not np.isfinite(ce90) and len(lengths):
-        ce90 = float(np.percentile(lengths, 90.0))
-    limit = max(
-        [1e-3, *(value for value in (float(np.max(lengths, initial=0.0)), ce90) if value > 0)]
-    )
-    with _figure(Path(path), (11.0, 5.6), overwrite) as figure:
-        field, cloud, histogram = figure.subplot_mosaic(
-            [["field", "cloud"], ["field", "histogram"]], width_ratios=(1.7, 1.0)
-        ).values()
-        _draw_field(field, alignment.source.grid, xy, residual, lengths)
-        _draw_cloud(cloud, residual, ce90, limit)
-        _draw_histogram(histogram, lengths, ce90, limit)
-        rmse = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
-        figure.suptitle(
-            f"Residuals of {len(lengths)} tie points: RMSE {rmse:.3g} PAN px, "
-            f"CE90 at check points {ce90:.3g} PAN px (model {alignment.correction.model})"
-        )
-
-
-def _draw_field(
-    axes: Axes, grid: Grid, xy: FloatArray, residual: FloatArray, lengths: FloatArray
-) -> None:
-    height, width = grid.shape
-    chosen = _spread(xy, np.arange(len(xy)), _ARROWS_AT_MOST)
-    if len(chosen):
-        typical = max(float(np.percentile(lengths, 90.0)), 1e-9)
-        arrows = axes.quiver(
-            xy[chosen, 0],
-            xy[chosen, 1],
-            residual[chosen, 0],
-            residual[chosen, 1],
-            lengths[chosen],
-            angles="xy",
-            scale_units="width",
-            scale=typical * 18,
-            cmap="viridis",
-            width=0.0028,
-            clip_on=False,
-        )
-        arrows.set_in_layout(False)  # those that leave the frame must not shrink it
-        key = float(f"{typical:.1g}")
-        axes.quiverkey(arrows, 0.9, 1.05, key, f"{key:g} PAN px", labelpos="W", coordinates="axes")
-        axes.figure.colorbar(arrows, ax=axes, label="length (PAN px)", shrink=0.8, pad=0.01)
-    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
-    axes.set(xlabel="column (MS px)", ylabel="row (MS px)")
-
-
-def _draw_cloud(axes: Axes, residual: FloatArray, ce90: float, limit: float) -> None:
-    from matplotlib.patches import Circle
-
-    axes.axhline(0.0, color="0.85", lw=0.8, zorder=0)
-    axes.axvline(0.0, color="0.85", lw=0.8, zorder=0)
-    axes.scatter(residual[:, 0], residual[:, 1], s=6, c=_INK, alpha=0.5, lw=0)
-    if np.isfinite(ce90):
-        axes.add_patch(Circle((0.0, 0.0), ce90, fill=False, ec=_ACCENT, lw=1.3))
-        axes.annotate(
-            "CE90", (ce90 * 0.7071, -ce90 * 0.7071), color=_ACCENT, fontsize=8, xytext=(3, 3),
-            textcoords="offset points",
-        )  # fmt: skip
-    reach = 1.08 * limit
-    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
-    axes.set(xlabel="along columns (PAN px)", ylabel="along rows (PAN px)")
-
-
-def _draw_histogram(axes: Axes, lengths: FloatArray, ce90: float, limit: float) -> None:
-    bins = int(np.clip(np.sqrt(len(lengths)) * 1.5, 5, 40))
-    axes.hist(lengths, bins=bins, range=(0.0, limit), color=_INK, alpha=0.8)
-    if np.isfinite(ce90):
-        axes.axvline(ce90, color=_ACCENT, lw=1.3)
-        axes.annotate(
-            f"CE90 {ce90:.3g}", (ce90, 0.95), xycoords=("data", "axes fraction"), color=_ACCENT,
-            fontsize=8, xytext=(-3, 0), textcoords="offset points", ha="right", va="top",
-        )  # fmt: skip
-    axes.set(xlabel="length (PAN px)", ylabel="tie points", xlim=(0.0, limit))
 
 
 def draw_before_after(

@@ -20,12 +20,11 @@ from geodelreg.errors import GeodelregError
 from geodelreg.image.reader import open_raster
 from geodelreg.options import WriteOptions
 from geodelreg.product.atomic import exclusive, write_text_atomically
-from geodelreg.product.figures import draw_residuals
 from geodelreg.product.gcps import read_gcps
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from tests.integration.raster_samples import GCPS, TAGS, UTM18, correction_of, make_cog
-from tests.unit.alignment_sample import alignment
+from tests.unit.test_figures import draw_sample
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUND = Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 4_000_000.0)
@@ -82,7 +81,7 @@ def edited_cog(folder: Path) -> object:
 def without_matplotlib(folder: Path) -> object:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
-        return draw_residuals(alignment(), folder / "figure.png")
+        return draw_sample(folder / "figure.png")
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from geodelreg.errors import MissingExtraError, OutputExistsError, UsageError
-from geodelreg.product.figures import draw_before_after, draw_matches, draw_residuals
+from geodelreg.product.figures import draw_before_after, draw_matches
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import Band, Grid
-from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, UTM16, alignment, refused
+from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, UTM16, alignment
 
 KEPT = np.array([255, 207, 51])
 
@@ -154,26 +154,6 @@ def test_many_points_are_thinned_to_a_spread_of_lines(tmp_path: Path) -> None:
     assert 5 < np.count_nonzero(np.diff(lines.astype(int)) == 1) <= 40
 
 
-# --- residuals -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("made", [alignment(), refused()], ids=["aligned", "refused"])
-def test_residuals_are_drawn_with_any_number_of_points(tmp_path: Path, made: object) -> None:
-    draw_residuals(made, tmp_path / "residuals.png")  # type: ignore[arg-type]
-    assert pixels(tmp_path / "residuals.png").shape == (840, 1650, 3)
-
-
-def test_residual_figure_tells_its_numbers(tmp_path: Path) -> None:
-    """Text is kept as text by a style of the caller, which figures follow."""
-    from matplotlib import rc_context
-
-    with rc_context({"svg.fonttype": "none"}):
-        draw_residuals(alignment(), tmp_path / "residuals.svg")
-    text = (tmp_path / "residuals.svg").read_text()
-    # RMSE of the kept residuals 0.05, 0.05, 0.06 and 0
-    assert "Residuals of 4 tie points: RMSE 0.0464 PAN px, CE90 at check points 0.07 PAN px" in text
-
-
 # --- before and after ----------------------------------------------------------------------------
 
 
@@ -225,29 +205,35 @@ def test_bands_without_a_valid_pixel_are_white(tmp_path: Path) -> None:
     assert pixels(tmp_path / "empty.png").mean() > 240
 
 
+def draw_sample(path: str | Path, **options: bool) -> None:
+    """The tie points of the sample on plain bands."""
+    bands = band((80, 100), MS_HEADER), band((320, 400), PAN_HEADER)
+    draw_matches(*bands, alignment(), path, **options)
+
+
 # --- files ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_same_values_give_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     for name in ("one", "other"):
-        draw_residuals(alignment(), tmp_path / f"{name}{suffix}")
+        draw_sample(tmp_path / f"{name}{suffix}")
     assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"other{suffix}").read_bytes()
 
 
 def test_existing_figure_stays_without_overwrite(tmp_path: Path) -> None:
-    path = tmp_path / "residuals.png"
+    path = tmp_path / "matches.png"
     path.write_text("mine")
     with pytest.raises(OutputExistsError):
-        draw_residuals(alignment(), path)
+        draw_sample(path)
     assert path.read_text() == "mine"
-    draw_residuals(alignment(), path, overwrite=True)
+    draw_sample(path, overwrite=True)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_unknown_extension_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"Use one of: \.png, \.svg, \.pdf"):
-        draw_residuals(alignment(), tmp_path / "residuals.bmp")
+        draw_sample(tmp_path / "matches.bmp")
     assert not list(tmp_path.iterdir())
 
 
@@ -256,19 +242,18 @@ def test_missing_matplotlib_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'geodelreg\[report\]'"):
-        draw_residuals(alignment(), tmp_path / "residuals.png")
+        draw_sample(tmp_path / "matches.png")
 
 
 def test_drawing_leaves_no_global_state(tmp_path: Path) -> None:
     code = """
 import sys
 import matplotlib
-from geodelreg.product.figures import draw_residuals
-from tests.unit.alignment_sample import alignment
+from tests.unit.test_figures import draw_sample
 
 names = [name for name in matplotlib.rcParams if name != "backend"]
 before = [matplotlib.rcParams[name] for name in names]
-draw_residuals(alignment(), sys.argv[1])
+draw_sample(sys.argv[1])
 assert [matplotlib.rcParams[name] for name in names] == before
 assert "matplotlib.pyplot" not in sys.modules
 """
