@@ -8,15 +8,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from geodelreg.version import __version__
+
 if TYPE_CHECKING:
     from geodelreg import errors
     from geodelreg.api import align, check
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.check import Check
-    from geodelreg.types import Alignment
+    from geodelreg.values.result import Alignment
     from geodelreg.writing import export_gcps, revert, write, write_in_place
 
-__version__ = "0.1.0"
 
 __all__ = [
     "AlignOptions",
@@ -35,7 +36,7 @@ __all__ = [
 
 _HOMES = {
     "AlignOptions": "geodelreg.options",
-    "Alignment": "geodelreg.types",
+    "Alignment": "geodelreg.values.result",
     "Check": "geodelreg.product.check",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",

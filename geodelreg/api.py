@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 
+from geodelreg.align_pair import align_pair
 from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
@@ -16,23 +16,14 @@ from geodelreg.errors import (
 )
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
+from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.check import (
-    is_affine_enough,
-    judge_misalignment,
-    measure_misalignment,
-)
-from geodelreg.pipeline.register import correction_of, register
-from geodelreg.pipeline.solve import Solution
-from geodelreg.pipeline.state import Pair, Progress, part_of
+from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
-from geodelreg.types import (
-    Alignment,
-    CheckOutcome,
-    Misalignment,
-)
+from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution
+from geodelreg.values.timings import Timings
 from geodelreg.writing import AnyPath
 
 MAX_LIMIT_PX = 1e6
@@ -40,23 +31,35 @@ MAX_LIMIT_PX = 1e6
 
 @dataclass(frozen=True, slots=True)
 class _Rasters:
-    """The two rasters, open, and their paths as the user named them."""
+    """The two rasters, open, as the user named them, and how long it all takes."""
 
     ms: RasterReader
     pan: RasterReader
-    source_paths: tuple[str, ...]
-    reference_path: str
+    source: Input
+    reference: Input
+    timings: Timings
 
 
 @contextmanager
 def _open(
     source: AnyPath | Sequence[AnyPath], reference: AnyPath, options: AlignOptions
 ) -> Iterator[_Rasters]:
-    with (
-        open_raster(source, options.masks, allow=options.allow) as ms,
-        open_raster(reference, options.pan_masks, allow=options.allow) as pan,
-    ):
-        yield _Rasters(ms, pan, _paths(source), str(reference))
+    timings = Timings()
+    with ExitStack() as stack:
+        with timings("open"):
+            ms = stack.enter_context(open_raster(source, options.masks, allow=options.allow))
+            pan = stack.enter_context(
+                open_raster(reference, options.pan_masks, allow=options.allow)
+            )
+            if options.band:
+                check_band(ms, options.band)
+            check_band(pan, options.pan_band)
+            inputs = _input(ms, _paths(source)), _input(pan, (str(reference),))
+        yield _Rasters(ms, pan, *inputs, timings)
+
+
+def _input(reader: RasterReader, paths: tuple[str, ...]) -> Input:
+    return Input(paths, reader.grid, tuple(map(fingerprint, paths)))
 
 
 def align(
@@ -95,9 +98,8 @@ def align(
         Its other kinds, for bad input.
     """
     options = options or AlignOptions()
-    start = perf_counter()
     with _open(source, reference, options) as rasters:
-        alignment, _ = _examine(rasters, options, progress, start)
+        alignment, _ = _examine(rasters, options, progress)
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
         raise AlignmentRefusedError(
@@ -151,11 +153,10 @@ def check(
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options = replace(options or AlignOptions(), tolerance_px=0.0)
-    start = perf_counter()
     with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = part_of(progress, 0, count + 1)
-        alignment, misalignment = _examine(rasters, options, report, start)
+        alignment, misalignment = _examine(rasters, options, report)
         bands = [
             _check_band(
                 rasters, replace(options, band=n), limit_px, part_of(progress, n, count + 1)
@@ -173,16 +174,13 @@ def check(
 
 
 def _check_band(
-    rasters: _Rasters,
-    options: AlignOptions,
-    limit_px: float,
-    progress: Progress | None,
+    rasters: _Rasters, options: AlignOptions, limit_px: float, progress: Progress | None
 ) -> BandCheck:
     """One band by itself; a band that shows nothing spoils no other."""
     assert options.band is not None
     name = rasters.ms.band_names[options.band - 1]
     try:
-        pair, solution = register(rasters.ms, rasters.pan, options, progress)
+        pair, solution = align_pair(rasters.ms, rasters.pan, options, progress)
     except (NoDataError, NoOverlapError) as error:
         return BandCheck(options.band, name, CheckOutcome.CANNOT_TELL, reason=error.cause)
     misalignment = measure_misalignment(pair, solution)
@@ -192,55 +190,34 @@ def _check_band(
 
 
 def _examine(
-    rasters: _Rasters,
-    options: AlignOptions,
-    progress: Progress | None,
-    start: float,
+    rasters: _Rasters, options: AlignOptions, progress: Progress | None
 ) -> tuple[Alignment, Misalignment]:
-    """Register two open rasters; `start` is when opening them began."""
+    """Align two open rasters."""
     ms, pan = rasters.ms, rasters.pan
-    if options.band:
-        check_band(ms, options.band)
-    check_band(pan, options.pan_band)
-    files = (*rasters.source_paths, rasters.reference_path)
-    prints = {path: fingerprint(path) for path in files}
-    opened = perf_counter() - start
     try:
-        pair, solution = register(ms, pan, options, progress)
+        pair, solution = align_pair(ms, pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
-    alignment = _alignment(rasters, pair, solution)
-    unsure = [unsettled(Path(path)) for path in files]
+    unsure = [unsettled(Path(path)) for path in (*rasters.source.paths, *rasters.reference.paths)]
     notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
-    timings = {"open": opened, **alignment.timings_s, "total": perf_counter() - start}
-    alignment = replace(
-        alignment,
-        timings_s=timings,
-        warnings=alignment.warnings + notes + mask_warnings(ms, pan),
-        extra={"fingerprints": prints},
-    )
+    alignment = _alignment(rasters, pair, solution, notes + mask_warnings(ms, pan))
     return alignment, measure_misalignment(pair, solution)
 
 
-def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
+def _alignment(
+    rasters: _Rasters, pair: Pair, solution: Solution, notes: tuple[str, ...] = ()
+) -> Alignment:
     masks = mask_uses(rasters.ms, rasters.pan)
     return Alignment(
-        source=pair.source.grid,
-        reference=pair.reference.grid,
-        source_paths=rasters.source_paths,
-        reference_path=rasters.reference_path,
-        correction=correction_of(pair, solution),
-        tie_points=solution.tie_points,
-        accuracy=solution.accuracy,
-        verdict=solution.verdict,
-        step_counts=solution.step_counts,
-        band_weights=solution.band_weights,
-        warnings=solution.warnings,
-        crs_operation=pair.mapping.operation.description,
+        source=rasters.source,
+        reference=rasters.reference,
+        solution=solution,
         options=pair.options,
-        versions=versions(with_proj=pair.through_proj or bool(masks)),
-        timings_s=solution.timings_s,
+        crs_operation=pair.header.operation.description,
+        warnings=solution.warnings + notes,
         masks=masks,
+        versions=versions(with_proj=pair.through_proj or bool(masks)),
+        timings_s={**pair.timings, "total": pair.timings.elapsed_s},
     )
 
 

@@ -6,10 +6,7 @@ All derive from `GeodelregError`.  A message names the file, the cause and what 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
-
-if TYPE_CHECKING:
-    from geodelreg.types import Alignment
+from typing import Any, ClassVar
 
 
 def shown(text: str) -> str:
@@ -140,6 +137,6 @@ class AlignmentRefusedError(GeodelregError):
 
     exit_code = 3
 
-    def __init__(self, cause: str, remedy: str = "", alignment: Alignment | None = None) -> None:
+    def __init__(self, cause: str, remedy: str = "", alignment: Any = None) -> None:
         super().__init__(cause, remedy)
         self.alignment = alignment

@@ -99,7 +99,8 @@ class AlignOptions:
     ratio: float = _knob(0.8, "Lowe's limit on nearest over second nearest descriptor distance.")
     max_keypoints: int = _knob(
         6000,
-        "Keypoints kept per image, strongest first; delaunay spreads them over the image.",
+        "Keypoints kept per image, strongest first; delaunay spreads them over the image, and on "
+        "the first look takes a quarter of them, but 1500 where so many are allowed.",
     )
     max_shift_px: float | None = _knob(
         None, "Refuse a correction that shifts the centre by more PAN pixels than this."

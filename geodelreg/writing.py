@@ -16,7 +16,8 @@ from geodelreg.image.reader import open_raster
 from geodelreg.masking import parse_mask
 from geodelreg.options import WriteOptions
 from geodelreg.product.provenance import provenance_tags
-from geodelreg.types import Alignment, Correction, Gcp, Outcome
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Alignment, Correction, Outcome
 
 AnyPath = str | PathLike[str]
 
@@ -53,7 +54,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.warp import write_warped
 
     options = options or WriteOptions()
-    tags, pan = provenance_tags(alignment), Path(alignment.reference_path)
+    tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
     notes: list[str] = []
     with (
         _targets(alignment, Path(target)) as pairs,
@@ -65,7 +66,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
             correction, gcps = _of_file(alignment, path)
             if options.warp:
                 notes += write_warped(
-                    path, out, correction, alignment.reference, tags, options, pan
+                    path, out, correction, alignment.reference.grid, tags, options, pan
                 )
             else:
                 notes += write_corrected(path, out, correction, gcps, tags, options)
@@ -90,12 +91,12 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.inplace import edit_in_place
 
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
-        tidy(map(Path, alignment.source_paths))
+        tidy(map(Path, alignment.source.paths))
         return []
     tags = provenance_tags(alignment)
     notes: list[str] = []
-    with together(map(Path, alignment.source_paths)):
-        for name in alignment.source_paths:
+    with together(map(Path, alignment.source.paths)):
+        for name in alignment.source.paths:
             notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
     return notes
 
@@ -169,7 +170,7 @@ def input_paths(names: Iterable[str], allow: str) -> list[Path]:
 def _inputs(alignment: Alignment) -> list[Path]:
     options = alignment.options
     masks = [parse_mask(mask).path for mask in (*options.masks, *options.pan_masks)]
-    names = [*alignment.source_paths, alignment.reference_path, *masks]
+    names = [*alignment.source.paths, alignment.reference.paths[0], *masks]
     return input_paths(names, options.allow)
 
 
@@ -180,7 +181,7 @@ def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Pa
 
     if target == STDOUT:
         raise UsageError("A raster cannot be written to standard output", "Name a file.")
-    sources = [as_path(path) for path in alignment.source_paths]
+    sources = [as_path(path) for path in alignment.source.paths]
     if len(sources) == 1:
         yield [(sources[0], target)]
         return
@@ -206,7 +207,7 @@ def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, .
     from geodelreg.product.gcps import gcps_from_alignment
 
     gcps, shared = gcps_from_alignment(alignment), alignment.correction
-    if len(alignment.source_paths) == 1:
+    if len(alignment.source.paths) == 1:
         return shared, gcps
     with open_raster(path, allow=alignment.options.allow) as reader:
         own = reader.grid.transform

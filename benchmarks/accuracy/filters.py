@@ -21,9 +21,10 @@ import cv2
 import numpy as np
 
 from benchmarks.report import machine, replace_section
-from geodelreg.match.delaunay_filter import filter_matches, star_filter
-from geodelreg.match.zhang2013 import initial_status, reject_unshared
-from geodelreg.types import BoolArray, FloatArray, IntArray, Status
+from geodelreg.fit.delaunay_mesh import filter_matches, star_filter
+from geodelreg.paper.zhang2013 import initial_status, reject_unshared
+from geodelreg.values.points import Status
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 SIZE_PX = 1000.0
 PRECISION, RECALL = 0.99, 0.97

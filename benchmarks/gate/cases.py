@@ -13,7 +13,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from benchmarks.scenes.imagery import Imagery, ImageryNotFoundError, sentinel2
-from geodelreg.types import Window
+from geodelreg.values.raster import Window
 
 TUNING, HELD_OUT = "tuning", "held out"
 LAND_WINDOW = (slice(260, 1260), slice(60, 1060))

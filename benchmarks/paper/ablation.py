@@ -21,7 +21,7 @@ from benchmarks.paper.methods import (
     run_steps,
     true_rmse,
 )
-from geodelreg.types import Status
+from geodelreg.values.points import Status
 
 T = TypeVar("T")
 ALL, NONE, MESH = "all steps", "no step", "our filter"

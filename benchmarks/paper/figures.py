@@ -25,8 +25,10 @@ from benchmarks.paper.methods import (
 )
 from benchmarks.paper.page import CONTAMINATION, MEASURES, effect, group, spread_of
 from benchmarks.paper.scenes import Case
+from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.geo.triangulation import delaunay
-from geodelreg.types import Band, BoolArray, FloatArray, Status
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Band, BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -135,14 +137,15 @@ def registered_images(stage: Stage) -> Registered:
     square = max(pan.data.shape) / BOARD_CELLS
     odd = ((rows // square + columns // square) % 2).astype(bool)
     found: Registered = []
-    for method, matrix in corrections(stage).items():
+    for method, correction in corrections(stage).items():
         board = np.repeat(_grey(pan)[:, :, None], 3, axis=2)
-        if matrix is not None:
-            x, y = to_ms @ tuple(np.moveaxis(pair.to_source(matrix, places), -1, 0))
+        if correction is not None:
+            there = Inverse(pair.to_reference(correction)).forward(places)
+            x, y = to_ms @ tuple(np.moveaxis(there, -1, 0))
             index = [y - 0.5, x - 0.5]
             grey = ndimage.map_coordinates(_grey(ms), index, order=1, cval=np.nan)
             board[odd] = grey[odd, None] * MS_TINT
-        title = f"{method}: {true_rmse(stage, matrix):.2g} px off"
+        title = f"{method}: {true_rmse(stage, correction):.2g} px off"
         found.append((title, np.nan_to_num(board, nan=1.0)))
     return found
 

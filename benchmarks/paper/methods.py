@@ -13,13 +13,27 @@ import numpy as np
 from affine import Affine
 
 from benchmarks.scenes.truth import Truth, grid_rmse
+from geodelreg.align_pair import align_pair
+from geodelreg.coarse.descriptors import match_descriptors, one_to_one
+from geodelreg.coarse.scopes import read_overview
 from geodelreg.errors import GeodelregError
+from geodelreg.fine.looks import mean_band
+from geodelreg.fine.overlay import overlay
+from geodelreg.fine.passes import COARSE_SIGMA
+from geodelreg.fine.surface import make_surface
+from geodelreg.fine.tiles import overview_tile
+from geodelreg.fine.tuning import surface_sigma
+from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.fit.estimate import Observations, minimum_points
-from geodelreg.geo.affine import affine_from_matrix, affine_matrix, apply_affine
-from geodelreg.match.delaunay_filter import filter_matches
-from geodelreg.match.descriptors import match_descriptors, matched_xy, one_to_one
-from geodelreg.match.surface import make_surface
-from geodelreg.match.zhang2013 import (
+from geodelreg.fit.models import Frame
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.geo.maps.smooth import Inverse
+from geodelreg.judge.accuracy import grey_rmse
+from geodelreg.options import AlignOptions
+from geodelreg.pair import Pair, make_pair, roles
+from geodelreg.paper.baseline import grey_keypoints, least_squares, paper_scopes
+from geodelreg.paper.zhang2013 import (
     StatusArray,
     ZhangOptions,
     initial_status,
@@ -29,16 +43,10 @@ from geodelreg.match.zhang2013 import (
     reject_duplicates,
     reject_unshared,
 )
-from geodelreg.options import AlignOptions
-from geodelreg.pipeline.baseline import grey_keypoints, least_squares, paper_scopes
-from geodelreg.pipeline.dense import surface_sigma
-from geodelreg.pipeline.evidence import grey_rmse, overlay
-from geodelreg.pipeline.refinement import COARSE_SIGMA, working_tile
-from geodelreg.pipeline.register import register
-from geodelreg.pipeline.search import WorkingPair, mean_band, read_working_pair
-from geodelreg.pipeline.state import Pair, make_pair
-from geodelreg.pipeline.tiles import roles
-from geodelreg.types import BoolArray, FloatArray, Status, WindowReader
+from geodelreg.values.guess import Overview
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Status
+from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
 
 RIGHT_PX = 1.0
 """A match is right within this many coarser pixels of the truth: three standard deviations of a
@@ -72,19 +80,19 @@ class Stage:
     Attributes
     ----------
     pair : Pair
-    images : WorkingPair
+    images : Overview
         At the coarser ground sampling distance, as the paper's methods read them.
     truth : Truth
     """
 
     pair: Pair
-    images: WorkingPair
+    images: Overview
     truth: Truth
 
     @property
-    def true_matrix(self) -> FloatArray:
-        """(2, 3) MS pixels to MS header pixels, as it should be."""
-        return affine_matrix(~Affine(*self.truth.ms_header) @ Affine(*self.truth.ms_true))
+    def true_map(self) -> PixelMap:
+        """MS pixels to MS header pixels, as it should be."""
+        return AffineMap(~Affine(*self.truth.ms_header) @ Affine(*self.truth.ms_true))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +163,7 @@ class Score:
 def set_stage(source: WindowReader, reference: WindowReader, truth: Truth) -> Stage:
     """Read the pair as ``--method zhang2013`` does."""
     pair = make_pair(source, reference, AlignOptions())
-    return Stage(pair, read_working_pair(pair, next(paper_scopes(pair))), truth)
+    return Stage(pair, read_overview(pair, next(paper_scopes(pair))), truth)
 
 
 def match_plainly(stage: Stage) -> tuple[Matched, dict[str, int]]:
@@ -170,7 +178,7 @@ def match_plainly(stage: Stage) -> tuple[Matched, dict[str, int]]:
     images, pair = stage.images, stage.pair
     source, reference = grey_keypoints(images)
     matches = match_descriptors(source, reference)
-    source_xy, reference_xy = matched_xy(source, reference, matches)
+    source_xy, reference_xy = matches.xy(source, reference)
     to_source = ~pair.source.grid.transform @ images.source[0].grid.transform
     to_reference = ~pair.reference.grid.transform @ images.reference.grid.transform
     source_px = apply_affine(to_source, source_xy)
@@ -185,7 +193,7 @@ def match_plainly(stage: Stage) -> tuple[Matched, dict[str, int]]:
 def _error_px(stage: Stage, source_px: FloatArray, reference_px: FloatArray) -> FloatArray:
     """(M,) distance from the truth in pixels of the coarser image."""
     pair = stage.pair
-    gap = pair.to_reference(stage.true_matrix, source_px) - reference_px
+    gap = pair.to_reference(stage.true_map).forward(source_px) - reference_px
     return np.asarray(np.hypot(gap[:, 0], gap[:, 1]) / max(pair.pan_px_per_source_px, 1.0))
 
 
@@ -224,15 +232,15 @@ def run_mesh(matched: Matched) -> tuple[BoolArray, dict[str, int]]:
     return chosen, counts | {"our filter": int(chosen.sum())}
 
 
-def fit_plainly(stage: Stage, matched: Matched, kept: BoolArray) -> FloatArray | None:
-    """Step 7: (2, 3) least-squares affine, MS pixels to header pixels; None of too few points."""
+def fit_plainly(stage: Stage, matched: Matched, kept: BoolArray) -> PixelMap | None:
+    """Step 7: least-squares affine, MS pixels to header pixels; None of too few points."""
     if kept.sum() < minimum_points("affine"):
         return None
     points = _observations(stage, matched, kept)
-    return least_squares("affine", points, stage.pair.frame()).transformation.matrix
+    return least_squares("affine", points, Frame.of(stage.pair)).map
 
 
-def fit_robustly(stage: Stage, matched: Matched, kept: BoolArray) -> FloatArray | None:
+def fit_robustly(stage: Stage, matched: Matched, kept: BoolArray) -> PixelMap | None:
     """An affine by OpenCV's USAC MAGSAC instead of step 7, at one coarser pixel."""
     if kept.sum() < minimum_points("affine"):
         return None
@@ -243,35 +251,37 @@ def fit_robustly(stage: Stage, matched: Matched, kept: BoolArray) -> FloatArray 
         ransacReprojThreshold=RIGHT_PX * max(ratio, 1.0) / ratio, maxIters=20_000,
         confidence=0.9999,
     )  # fmt: skip
-    return None if matrix is None else np.asarray(matrix, dtype=np.float64)
+    return None if matrix is None else AffineMap.of(np.asarray(matrix, np.float64))
 
 
 def _observations(stage: Stage, matched: Matched, kept: BoolArray) -> Observations:
     reference = matched.reference_px[kept]
-    target, covariance = stage.pair.header_px(reference, np.tile(np.eye(2), (len(reference), 1, 1)))
+    equal = np.tile(np.eye(2), (len(reference), 1, 1))
+    target, covariance = Inverse(stage.pair.header).carry(reference, equal)
     return Observations(matched.source_px[kept], target, covariance)
 
 
-def true_rmse(stage: Stage, matrix: FloatArray | None) -> float:
+def true_rmse(stage: Stage, correction: PixelMap | None) -> float:
     """Error of a correction over 21 × 21 points of the MS raster, PAN px."""
-    if matrix is None:
+    affine = None if correction is None else correction.as_affine()
+    if affine is None:
         return math.nan
-    corrected = Affine(*stage.truth.ms_header) @ affine_from_matrix(matrix)
+    corrected = Affine(*stage.truth.ms_header) @ affine
     return grid_rmse(corrected, stage.truth)["rmse_px"]
 
 
-def grey_error(stage: Stage, matrix: FloatArray | None) -> float:
+def grey_error(stage: Stage, correction: PixelMap | None) -> float:
     """E1 of the mean of the visible bands against low-passed PAN under a correction, DN of PAN."""
-    if matrix is None:
+    if correction is None:
         return math.nan
     part = roles(stage.pair)
-    tile = working_tile(part, stage.images)
+    tile = overview_tile(part, stage.images)
     ms = mean_band(stage.images.source[:3])
     template, finer = ms, stage.images.reference
-    if not part.ms_is_template():
+    if not part.ms_is_template:
         template, finer = finer, template
     surface = make_surface(finer, part.surface.grid, surface_sigma(part, tile, COARSE_SIGMA))
-    return grey_rmse(overlay(part, template, surface, matrix), part.ms_is_template())
+    return grey_rmse(overlay(part, template, surface, correction), part.ms_is_template)
 
 
 def score_keypoints(
@@ -289,15 +299,15 @@ def score_keypoints(
         Of everything before the fit.
     """
     start = process_time()
-    matrix = fit_plainly(stage, matched, kept)
+    correction = fit_plainly(stage, matched, kept)
     cpu_s += process_time() - start
     control = math.nan
-    if matrix is not None:
-        there = stage.pair.to_reference(matrix, matched.source_px[kept])
+    if correction is not None:
+        there = stage.pair.to_reference(correction).forward(matched.source_px[kept])
         control = float(np.sqrt(((there - matched.reference_px[kept]) ** 2).sum(axis=1).mean()))
     return Score(
-        steps, *_counts(matched.error_px[kept]), control, true_rmse(stage, matrix),
-        grey_error(stage, matrix), cpu_s,
+        steps, *_counts(matched.error_px[kept]), control, true_rmse(stage, correction),
+        grey_error(stage, correction), cpu_s,
     )  # fmt: skip
 
 
@@ -311,42 +321,42 @@ def score_ours(stage: Stage) -> Score:
     """Figures of the library's default, with its gate's verdict, whatever that is."""
     start = process_time()
     try:
-        _, solution = register(stage.pair.source, stage.pair.reference, AlignOptions())
+        _, solution = align_pair(stage.pair.source, stage.pair.reference, AlignOptions())
     except GeodelregError as error:
         lost = (math.nan, math.nan, math.nan, process_time() - start)
         return Score({}, 0, 0, 0, 0, *lost, outcome=type(error).__name__)
     cpu_s = process_time() - start
     points = solution.tie_points
     off_px = _error_px(stage, points.source_px[points.kept], points.reference_px[points.kept])
-    matrix = solution.transformation.matrix if points.kept.any() else None
-    rmse = true_rmse(stage, matrix)
+    correction = solution.map if points.kept.any() else None
+    rmse = true_rmse(stage, correction)
     return Score(
-        solution.step_counts, *_counts(off_px), solution.accuracy.fit_rmse_px, rmse,
-        grey_error(stage, matrix), cpu_s, solution.verdict.outcome.value,
+        dict(solution.step_counts), *_counts(off_px), solution.accuracy.fit_rmse_px, rmse,
+        grey_error(stage, correction), cpu_s, solution.verdict.outcome.value,
         rmse if solution.verdict.accepted else math.nan,
     )  # fmt: skip
 
 
-def corrections(stage: Stage) -> dict[str, FloatArray | None]:
-    """What each method but `MESH` finds on a pair, refused or not: (2, 3), None where nothing."""
+def corrections(stage: Stage) -> dict[str, PixelMap | None]:
+    """What each method but `MESH` finds on a pair, refused or not; None where nothing."""
     matched, _ = match_plainly(stage)
     found = {
         method: fit_plainly(stage, matched, run_steps(matched, steps)[0] == Status.KEPT)
         for method, steps in STEPS_OF.items()
     }
-    _, solution = register(stage.pair.source, stage.pair.reference, AlignOptions())
-    return {**found, OURS: solution.transformation.matrix if len(solution.tie_points) else None}
+    _, solution = align_pair(stage.pair.source, stage.pair.reference, AlignOptions())
+    return {**found, OURS: solution.map if len(solution.tie_points) else None}
 
 
 def gate_on(stage: Stage, method: str) -> tuple[str, float]:
     """The gate's verdict on a method of the library, and the error of what it accepted."""
     options = AlignOptions(method=GATED[method])
     try:
-        _, solution = register(stage.pair.source, stage.pair.reference, options)
+        _, solution = align_pair(stage.pair.source, stage.pair.reference, options)
     except GeodelregError as error:
         return type(error).__name__, math.nan
     accepted = solution.verdict.accepted
-    rmse = true_rmse(stage, solution.transformation.matrix) if accepted else math.nan
+    rmse = true_rmse(stage, solution.map) if accepted else math.nan
     return solution.verdict.outcome.value, rmse
 
 

@@ -23,7 +23,7 @@ from benchmarks.scenes.imagery import ImageryNotFoundError
 from benchmarks.scenes.make import write_scene
 from benchmarks.scenes.truth import grid_rmse
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Status
+from geodelreg.values.points import Status
 
 SEEDS, QUICK_SEEDS = 3, 1
 Row = dict[str, Any]
@@ -79,7 +79,7 @@ def measure(case: Case, data: Path, with_gate: bool, with_ablation: bool) -> Row
         row: Row = {**asdict(case), "methods": rows}
         truth = stage.truth
         row["header_px"] = grid_rmse(Affine(*truth.ms_header), truth)["rmse_px"]
-        row["e1_truth"] = methods.grey_error(stage, stage.true_matrix)
+        row["e1_truth"] = methods.grey_error(stage, stage.true_map)
         row["pan_per_coarser_px"] = max(stage.pair.pan_px_per_source_px, 1.0)
         passed = methods.run_steps(matched, ())[0] == Status.KEPT
         row["wrong_share"] = float(1 - matched.right[passed].mean()) if passed.any() else math.nan

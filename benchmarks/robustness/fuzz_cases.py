@@ -27,7 +27,8 @@ from benchmarks.robustness.mutations import mutate
 from benchmarks.robustness.seeds import RATIO, TRUE, UTM, Seed, make_seeds
 from geodelreg.errors import AlignmentRefusedError, GeodelregError
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 Row = dict[str, Any]
 
@@ -219,7 +220,7 @@ def _wkt() -> str:
 def _write(case: Case) -> None:
     from geodelreg.product.geotiff import write_corrected
     from geodelreg.product.warp import write_warped
-    from geodelreg.types import Grid
+    from geodelreg.values.raster import Grid
 
     options = WriteOptions(**case.rng.choice(WRITE_OPTIONS))
     target = case.out / "out.tif"
@@ -278,7 +279,7 @@ def _check(case: Case) -> None:
 
 def _gcps(case: Case) -> None:
     from geodelreg.product.gcps import GcpContext, write_gcps
-    from geodelreg.types import Grid
+    from geodelreg.values.raster import Grid
     from geodelreg_cli.main import cli
 
     wanted, suffix = case.rng.choice(list(GCP_EXTENSIONS.items()))

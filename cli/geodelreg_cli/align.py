@@ -28,7 +28,7 @@ from geodelreg_cli.options import (
 )
 
 if TYPE_CHECKING:
-    from geodelreg.types import Alignment
+    from geodelreg.values.result import Alignment
 
 OUTPUT, CORRECTION, FORMAT = "Output", "How to align", "How OUT is written"
 FILE = click.Path(path_type=Path)
@@ -284,7 +284,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
 
 def _step_counts(alignment: Alignment) -> str:
     """Points that survive each step, as in the paper's "112 → 97 → 91"."""
-    counts = alignment.step_counts.items()
+    counts = alignment.solution.step_counts.items()
     return "Points: " + " → ".join(f"{count} ({step})" for step, count in counts)
 
 

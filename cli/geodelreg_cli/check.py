@@ -125,7 +125,7 @@ def _exit_code(found: Check) -> int:
     AlignmentRefusedError
         When nothing can be told.
     """
-    from geodelreg.types import CheckOutcome
+    from geodelreg.values.result import CheckOutcome
 
     if found.outcome is CheckOutcome.CANNOT_TELL:
         raise AlignmentRefusedError(

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from geodelreg.image.reader import RasterReader
-    from geodelreg.types import Alignment, Band
+    from geodelreg.values.raster import Band
+    from geodelreg.values.result import Alignment
 
 LONG_SIDE_PX = 1000
 
@@ -25,10 +26,10 @@ def bands_to_show(alignment: Alignment) -> tuple[Band, Band]:
     """
     from geodelreg.image.reader import open_raster
 
-    options, weights = alignment.options, alignment.band_weights
+    options, weights = alignment.options, alignment.solution.band_weights
     with (
-        open_raster(alignment.source_paths, allow=options.allow) as ms,
-        open_raster(alignment.reference_path, allow=options.allow) as pan,
+        open_raster(alignment.source.paths, allow=options.allow) as ms,
+        open_raster(alignment.reference.paths[0], allow=options.allow) as pan,
     ):
         heaviest = max(weights, key=lambda name: weights[name], default="")
         number = ms.band_names.index(heaviest) + 1 if heaviest in ms.band_names else 1
@@ -36,7 +37,7 @@ def bands_to_show(alignment: Alignment) -> tuple[Band, Band]:
 
 
 def _overview(reader: RasterReader, number: int) -> Band:
-    from geodelreg.types import Window
+    from geodelreg.values.raster import Window
 
     height, width = reader.grid.shape
     factor = max(1.0, max(height, width) / LONG_SIDE_PX)

@@ -21,7 +21,8 @@ from geodelreg_cli.options import (
 )
 
 if TYPE_CHECKING:
-    from geodelreg.types import Gcp, Grid
+    from geodelreg.values.points import Gcp
+    from geodelreg.values.raster import Grid
 
 EPILOG = """\
 Examples:

@@ -17,8 +17,8 @@ from io import StringIO
 
 import click
 
-from geodelreg import __version__
 from geodelreg.errors import AlignmentRefusedError, GeodelregError, shown
+from geodelreg.version import __version__
 from geodelreg_cli.interrupts import Terminated, termination_as_exception
 
 # name: (module that holds the click command of that name, line in the list of commands)

@@ -16,7 +16,7 @@ from rasterio.warp import Resampling, reproject
 
 import geodelreg
 from geodelreg.product.figures import draw_before_after
-from geodelreg.types import Band, Grid
+from geodelreg.values.raster import Band, Grid
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "sample_tiles"

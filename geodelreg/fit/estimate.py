@@ -6,16 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.models import PARAMETER_COUNT, Frame, Transformation, design, transformation
-from geodelreg.types import BoolArray, FloatArray, IntArray
+from geodelreg.fit.models import PARAMETER_COUNT, Frame, design, fitted_map
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 _MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
-_STUDENT_DOF = 6.0
-_REJECT_D2 = 25.0
-_SPREAD_ROUNDS = 6
-_MOST_STEPS = 16
-_CLOSE = 1e-4
-_MOST_LEVERAGE = 0.95
+_STUDENT_DOF = 6.0  # tails heavier than normal; unexplained: ablate
+REJECT_D2 = 25.0  # five standard deviations: of normal errors in the plane 4e-6 lie beyond
+_MOST_ROUNDS = 20  # unexplained: ablate
+_CONVERGED = 1e-9  # of half the raster: 1e-5 px of one of 20 000
+_RANK = 1e-13  # 450 times the rounding of float64
+_SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; unexplained: ablate
+_MOST_STEPS = 16  # a bound: it ends sooner
+_CLOSE = 1e-4  # relative to the median: far below its own error
+_MOST_LEVERAGE = 0.95  # a residual is magnified twentyfold at most; unexplained: ablate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +52,9 @@ class Estimate:
 
     Attributes
     ----------
-    transformation : Transformation
-        Source pixels to header pixels.
+    model : str
+    map : PixelMap
+        Source pixels to header pixels, with its standard error.
     parameters : (k,) float64
     covariance : (k, k) float64
         Of the parameters, from the residuals' real spread.
@@ -61,7 +66,8 @@ class Estimate:
         Squared Mahalanobis distance of each residual.
     """
 
-    transformation: Transformation
+    model: str
+    map: PixelMap
     parameters: FloatArray
     covariance: FloatArray
     frame: Frame
@@ -69,11 +75,10 @@ class Estimate:
     inlier: BoolArray
     distance2: FloatArray
 
-    def sigma_at(self, xy: FloatArray) -> FloatArray:
-        """(N,) standard error (radial, source pixels) of the transformation at (N, 2) pixels."""
-        columns, _ = design(self.transformation.model, xy, self.frame)
-        spread = np.einsum("nik,kl,nil->n", columns, self.covariance, columns)
-        return np.asarray(np.sqrt(np.maximum(spread, 0)) * self.frame.span_px)
+    @property
+    def is_shift(self) -> bool:
+        """True when nothing but a shift was fitted."""
+        return self.model == "shift"
 
 
 def minimum_points(model: str) -> int:
@@ -114,7 +119,7 @@ def _solve(
     weighted = np.matmul(weight * frame.span_px**2, columns)
     normal = np.einsum("nik,nil->kl", columns, weighted)
     moment = np.einsum("nik,ni->k", weighted, right)
-    return np.linalg.lstsq(normal, moment, rcond=1e-13)[0], normal
+    return np.linalg.lstsq(normal, moment, rcond=_RANK)[0], normal
 
 
 def robust_fit(
@@ -150,25 +155,30 @@ def robust_fit(
     columns, right = _system(model, points, frame)
     student = np.ones(len(points))
     previous = None
-    for number in range(20):
+    for number in range(_MOST_ROUNDS):
         inverse = _inverse(points.covariance, extra)
         parameters, normal = _solve(columns, right, inverse * student[:, None, None], frame)
-        residual = transformation(model, parameters, frame).residuals(points.source, points.target)
+        residual = fitted_map(model, parameters, frame).forward(points.source) - points.target
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = _variance_left(residual, variances, axes)
             inverse = _inverse(points.covariance, extra)
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
-        student = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
-        if previous is not None and np.abs(parameters - previous).max() < 1e-9:
+        student = student_weight(distance2)
+        if previous is not None and np.abs(parameters - previous).max() < _CONVERGED:
             break
         previous = parameters
-    inlier = distance2 < _REJECT_D2
+    inlier = distance2 < REJECT_D2
     sandwich = _sandwich(columns, inverse * student[:, None, None], residual, normal, frame)
     sandwich = sandwich / _response(distance2) ** 2
     return Estimate(
-        transformation(model, parameters, frame),
+        model, fitted_map(model, parameters, frame, sandwich),
         parameters, sandwich, frame, extra, inlier, distance2,
     )  # fmt: skip
+
+
+def student_weight(distance2: FloatArray) -> FloatArray:
+    """Weights by squared Mahalanobis distances in the plane."""
+    return (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
 
 
 def _inverse(covariance: FloatArray, extra: float) -> FloatArray:
@@ -183,11 +193,7 @@ def _inverse(covariance: FloatArray, extra: float) -> FloatArray:
 
 
 def _sandwich(
-    columns: FloatArray,
-    weight: FloatArray,
-    residual: FloatArray,
-    normal: FloatArray,
-    frame: Frame,
+    columns: FloatArray, weight: FloatArray, residual: FloatArray, normal: FloatArray, frame: Frame
 ) -> FloatArray:
     """Covariance of the parameters from the residuals themselves, as if each point were left out.
 
@@ -207,7 +213,7 @@ def _response(distance2: FloatArray) -> float:
     Reweighted least squares moves less than its weights say when a point moves, because the weight
     falls on the way; without this factor the covariance is a quarter too small in sigma.
     """
-    weight = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
+    weight = student_weight(distance2)
     return float((weight * _STUDENT_DOF / (_STUDENT_DOF + distance2)).sum() / weight.sum())
 
 
@@ -237,12 +243,13 @@ def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray
     def median_at(extra: float) -> float:
         return _median(one / (first + extra) + other / (second + extra))
 
-    low, high = 0.0, _median((residual**2).sum(axis=1)) + 1e-12
-    at_low = 1.0 - _MEDIAN_CHI2_2 / max(median_at(low), 1e-300)
+    low, high = 0.0, _median((residual**2).sum(axis=1)) + TINY
+    at_low = 1.0 - _MEDIAN_CHI2_2 / max(median_at(low), TINY)
     if not at_low > 0.0:
         return 0.0
-    at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), 1e-300)
-    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick
+    at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), TINY)
+    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick;
+    # scipy.optimize, for its brentq, would take 0.3 s to load
     kept = 0
     for _ in range(_MOST_STEPS):
         middle = high - at_high * (high - low) / (at_high - at_low)

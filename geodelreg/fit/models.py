@@ -7,17 +7,19 @@ keep a north-up raster north-up; ``similarity`` is one on the ground, whatever t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from affine import Affine
 
-from geodelreg.geo.affine import affine_from_matrix, affine_matrix, apply_affine
-from geodelreg.types import FloatArray
+from geodelreg.geo.affine import affine_from_matrix
+from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.pair import Pair
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import FloatArray
 
 MODEL_ORDER = ("shift", "scale", "similarity", "affine")
 NORTH_UP = ("shift", "scale")
-PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}
-IDENTITY: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}  # see `design`
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,41 +40,16 @@ class Frame:
     span_px: float
     metric: tuple[float, float, float, float] = (1.0, 0.0, 0.0, -1.0)
 
+    @classmethod
+    def of(cls, pair: Pair) -> Frame:
+        """Of the MS raster: its centre, half its longer side, metric axes."""
+        height, width = pair.source.grid.shape
+        a, b, c, d = pair.metric.ravel().tolist()
+        return cls((width / 2, height / 2), max(height, width) / 2, (a, b, c, d))
+
     def normalise(self, xy: FloatArray) -> FloatArray:
         """(N, 2) pixels to (N, 2) dimensionless coordinates around the centre."""
         return (np.asarray(xy, dtype=np.float64) - self.centre) / self.span_px
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Transformation:
-    """An affine of one of the models, in pixels.
-
-    Attributes
-    ----------
-    model : str
-        Name of the model.
-    matrix : (2, 3) float64
-    """
-
-    model: str
-    matrix: FloatArray
-
-    def __call__(self, xy: FloatArray) -> FloatArray:
-        """Transform (..., 2) points."""
-        return apply_affine(affine_from_matrix(self.matrix), np.asarray(xy, dtype=np.float64))
-
-    @property
-    def inverse(self) -> Transformation:
-        """The transformation back."""
-        return Transformation(self.model, affine_matrix(~affine_from_matrix(self.matrix)))
-
-    def residuals(self, source: FloatArray, target: FloatArray) -> FloatArray:
-        """(N, 2) transformed source minus target."""
-        return self(source) - target
-
-    def affine(self) -> Affine:
-        """As an `affine.Affine`."""
-        return affine_from_matrix(self.matrix)
 
 
 def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatArray]:
@@ -100,7 +77,7 @@ def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatA
         columns[:, 0, 2], columns[:, 1, 3] = x, y
     elif model == "affine":
         columns[:, 0, 2], columns[:, 0, 3] = x, y
-        columns[:, 1, 4], columns[:, 1, 5] = x, y
+        columns[:, 1, 4:] = u
     elif model == "similarity":
         growth, turn = _similarity_generators(frame)
         columns[:, :, 2], columns[:, :, 3] = u @ growth.T, u @ turn.T
@@ -113,16 +90,35 @@ def _similarity_generators(frame: Frame) -> tuple[FloatArray, FloatArray]:
     return np.eye(2), turn
 
 
-def transformation(model: str, parameters: FloatArray, frame: Frame) -> Transformation:
-    """Transformation in pixels from the parameters of `design`."""
+def fitted_map(
+    model: str, parameters: FloatArray, frame: Frame, covariance: FloatArray | None = None
+) -> PixelMap:
+    """The map of pixels that the parameters of `design` describe.
+
+    Parameters
+    ----------
+    model : str
+    parameters : (k,) float64
+    frame : Frame
+    covariance : (k, k) float64, optional
+        Of the parameters; without it the map counts as exact.
+    """
     linear = np.eye(2)
     if model == "scale":
         linear = np.diag(1.0 + parameters[2:4])
     elif model == "affine":
-        linear = np.eye(2) + parameters[2:6].reshape(2, 2)
+        linear = np.eye(2) + parameters[2:].reshape(2, 2)
     elif model == "similarity":
         growth, turn = _similarity_generators(frame)
         linear = np.eye(2) + parameters[2] * growth + parameters[3] * turn
     centre = np.array(frame.centre)
     offset = centre - linear @ centre + parameters[:2] * frame.span_px
-    return Transformation(model, np.column_stack([linear, offset]))
+    sigma = None if covariance is None else partial(_sigma_at, model, frame, covariance)
+    return AffineMap(affine_from_matrix(np.column_stack([linear, offset])), sigma)
+
+
+def _sigma_at(model: str, frame: Frame, covariance: FloatArray, xy: FloatArray) -> FloatArray:
+    """(N,) standard error (radial, pixels) at (N, 2) pixels."""
+    columns, _ = design(model, xy, frame)
+    spread = np.einsum("nik,kl,nil->n", columns, covariance, columns)
+    return np.asarray(np.sqrt(np.maximum(spread, 0)) * frame.span_px)

@@ -6,7 +6,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from geodelreg.types import FloatArray
+from geodelreg.values.raster import FloatArray
 
 
 def apply_affine(transform: Affine, xy: NDArray[np.float64]) -> FloatArray:
@@ -39,9 +39,3 @@ def affine_matrix(transform: Affine) -> FloatArray:
 def affine_from_matrix(matrix: FloatArray) -> Affine:
     """Affine transformation of a (2, 3) matrix."""
     return Affine(*(float(value) for value in np.asarray(matrix)[:2, :3].ravel()))
-
-
-def compose(outer: FloatArray, inner: FloatArray) -> FloatArray:
-    """(2, 3) matrix that applies `inner` first, then `outer`."""
-    linear = outer[:, :2] @ inner[:, :2]
-    return np.column_stack([linear, outer[:, :2] @ inner[:, 2] + outer[:, 2]])

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -14,13 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geodelreg.errors import CrsTransformError
-from geodelreg.geo.affine import affine_matrix, apply_affine
-from geodelreg.types import FloatArray, Grid
+from geodelreg.values.raster import FloatArray
 
 if TYPE_CHECKING:
     from pyproj import Transformer
-
-logger = logging.getLogger(__name__)
 
 _ONE_AT_A_TIME = Lock()
 """Of a transformation; pyproj makes those that it lists for a pair of CRSs for one thread each."""
@@ -101,6 +96,11 @@ def crs_operation(from_wkt: str, to_wkt: str) -> CrsOperation:
     return _operation(from_wkt, to_wkt)[1]
 
 
+def same_crs(one_wkt: str, other_wkt: str) -> bool:
+    """True when coordinates are the same in both."""
+    return _operation(one_wkt, other_wkt)[0] is None
+
+
 def map_points(xy: FloatArray, from_wkt: str, to_wkt: str) -> FloatArray:
     """Transform map coordinates.
 
@@ -129,75 +129,4 @@ def map_points(xy: FloatArray, from_wkt: str, to_wkt: str) -> FloatArray:
         x, y = transformer.transform(points[..., 0].ravel(), points[..., 1].ravel())
     out = np.stack([x, y], axis=-1).reshape(points.shape)
     out[~np.isfinite(out)] = np.nan
-    return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeaderMapping:
-    """Source pixels to reference pixels, as the two headers claim.
-
-    Attributes
-    ----------
-    source, reference : Grid
-    operation : CrsOperation
-    matrix : (2, 3) float64 or None
-        The mapping when it is affine (equal CRSs), else None.
-    """
-
-    source: Grid
-    reference: Grid
-    operation: CrsOperation
-    matrix: FloatArray | None
-
-    def forward(self, source_px: FloatArray) -> FloatArray:
-        """(..., 2) source pixels to (..., 2) reference pixels; NaN where undefined."""
-        return _through(source_px, self.source, self.reference)
-
-    def inverse(self, reference_px: FloatArray) -> FloatArray:
-        """(..., 2) reference pixels to (..., 2) source pixels; NaN where undefined."""
-        return _through(reference_px, self.reference, self.source)
-
-
-def _through(px: FloatArray, start: Grid, end: Grid) -> FloatArray:
-    ground = map_points(apply_affine(start.transform, px), start.crs_wkt, end.crs_wkt)
-    return apply_affine(~end.transform, ground)
-
-
-def header_mapping(source: Grid, reference: Grid) -> HeaderMapping:
-    """Mapping between two rasters' pixels through their geotransforms and CRSs."""
-    transformer, operation = _operation(source.crs_wkt, reference.crs_wkt)
-    matrix = None
-    if transformer is None:
-        matrix = affine_matrix(~reference.transform @ source.transform)
-    elif operation.warning:
-        logger.warning(operation.warning)
-    return HeaderMapping(source, reference, operation, matrix)
-
-
-PointMapping = Callable[[FloatArray], FloatArray]
-
-
-def linearise(mapping: PointMapping, at: FloatArray, step_px: float = 4.0) -> FloatArray:
-    """Local affine of a smooth mapping by central differences.
-
-    Parameters
-    ----------
-    mapping : callable
-        (..., 2) to (..., 2).
-    at : (N, 2) float64
-    step_px : float
-        Half width of the differences.
-
-    Returns
-    -------
-    (N, 2, 3) float64
-        ``mapping(at + d) ≈ A[:, :, :2] @ d + A[:, :, 2]``.
-    """
-    right, down = np.array([step_px, 0.0]), np.array([0.0, step_px])
-    stack = np.stack([at + right, at - right, at + down, at - down, at])
-    image = mapping(stack)
-    out = np.empty((len(at), 2, 3))
-    out[:, :, 0] = (image[0] - image[1]) / (2 * step_px)
-    out[:, :, 1] = (image[2] - image[3]) / (2 * step_px)
-    out[:, :, 2] = image[4]
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.geo.affine import apply_affine
-from geodelreg.types import BoolArray, FloatArray, Grid, Window
+from geodelreg.values.raster import BoolArray, FloatArray, Grid, Window
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry

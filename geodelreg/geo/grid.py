@@ -10,7 +10,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.errors import CrsTransformError
-from geodelreg.types import Grid, Window
+from geodelreg.values.raster import Grid, Window
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.types import FloatArray, IntArray
+from geodelreg.values.raster import FloatArray, IntArray
 
 
 class InteriorEdges(NamedTuple):

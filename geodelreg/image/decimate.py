@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodelreg.types import BoolArray, Float32Array, FloatArray, IntArray
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, IntArray
 
 
 class Share(NamedTuple):

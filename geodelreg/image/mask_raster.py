@@ -37,7 +37,7 @@ from geodelreg.masking import (
     is_old_landsat,
     quality_bands,
 )
-from geodelreg.types import BoolArray, FloatArray, Grid, IntArray, Window
+from geodelreg.values.raster import BoolArray, FloatArray, Grid, IntArray, Window
 
 _TOUCH_PX = 1e-3
 """Mask pixels that reach into an image pixel by less do not touch it: geotransforms are rounded."""

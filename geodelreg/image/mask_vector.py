@@ -15,7 +15,7 @@ from geodelreg.errors import GeodelregError, MaskError, MissingExtraError, Raste
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.masking import AUTO, VECTOR, MaskSpec
-from geodelreg.types import BoolArray, FloatArray, Grid
+from geodelreg.values.raster import BoolArray, FloatArray, Grid
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry

@@ -12,7 +12,7 @@ from geodelreg.door.names import LOCAL, check_name
 from geodelreg.image.mask_raster import RasterMask
 from geodelreg.image.mask_vector import VectorMask, is_vector
 from geodelreg.masking import MaskSpec, MaskUse, Ranges, parse_mask
-from geodelreg.types import BoolArray, Grid
+from geodelreg.values.raster import BoolArray, Grid
 
 _WHOLE = 0.995
 

@@ -23,7 +23,7 @@ from geodelreg.errors import (
 )
 from geodelreg.fatal import contradiction
 from geodelreg.image.environment import gdal_calls
-from geodelreg.types import Grid
+from geodelreg.values.raster import Grid
 
 if TYPE_CHECKING:
     from rasterio.crs import CRS

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geodelreg.image.decimate import BoxAverage
-from geodelreg.types import BoolArray, Float32Array, Window
+from geodelreg.values.raster import BoolArray, Float32Array, Window
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.masking import BINARY, LANDSAT_QA, SENTINEL2_SCL, VALUES, Ranges
-from geodelreg.types import BoolArray
+from geodelreg.values.raster import BoolArray
 
 # fill, dilated cloud, cirrus, cloud, cloud shadow
 _LANDSAT_HIDDEN = 0b11111

@@ -25,7 +25,7 @@ from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.overviews import Placement, find_placement
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.masking import quality_bands
-from geodelreg.types import BoolArray, Float32Array, Grid, Window
+from geodelreg.values.raster import BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader

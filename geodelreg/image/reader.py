@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,9 +17,14 @@ import numpy as np
 from geodelreg.door.names import LOCAL
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.environment import bounded_cache, gdal_calls
+from geodelreg.image.environment import (
+    TILES_BYTES,
+    bounded_cache,
+    gdal_calls,
+    passing_through,
+)
 from geodelreg.image.raster_file import RasterFile
-from geodelreg.types import Band, BoolArray, Float32Array, Grid, Window
+from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -121,11 +126,6 @@ class RasterReader:
         """Says so when one block is too large for a file to be read in pieces; else empty."""
         return "; ".join(file.block_note for file in self._files if file.block_note)
 
-    @property
-    def is_single_block(self) -> bool:
-        """True when windows cannot be read in pieces."""
-        return bool(self.block_note)
-
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
     ) -> list[Band]:
@@ -169,6 +169,10 @@ class RasterReader:
         if self.masks is not None:
             self.masks.stop_counting()
         return [Band(*planes[band], grid, band.name) for band in wanted]
+
+    def passing(self) -> AbstractContextManager[None]:
+        """While this lasts, what is read does not stay in GDAL's cache."""
+        return passing_through(TILES_BYTES)
 
     def _open_masks(
         self, files: list[RasterFile], names: Sequence[str] | None, stack: ExitStack, allow: str

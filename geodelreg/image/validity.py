@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.types import BoolArray
+from geodelreg.values.raster import BoolArray
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader

@@ -10,7 +10,7 @@ from typing import Any
 from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import accuracy_line, json_text, masks_line, plain, report_dict, short
-from geodelreg.types import Alignment, CheckOutcome, Misalignment
+from geodelreg.values.result import Alignment, CheckOutcome, Misalignment
 
 _UNKNOWN = float("nan")
 _NOTHING_KNOWN = Misalignment()
@@ -81,7 +81,7 @@ class Check:
     @property
     def source_name(self) -> str:
         """File name of MS, and the number of further files."""
-        first, *others = self.alignment.source_paths
+        first, *others = self.alignment.source.paths
         return Path(first).name + (f" and {len(others)} more" if others else "")
 
     @property

@@ -20,7 +20,8 @@ from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.product.atomic import write_bytes_atomically
 from geodelreg.product.targets import STDOUT
-from geodelreg.types import Alignment, Band, FloatArray, Grid, IntArray
+from geodelreg.values.raster import Band, FloatArray, Grid, IntArray
+from geodelreg.values.result import Alignment
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,8 +120,8 @@ def draw_matches(
     """
     points = alignment.tie_points
     sides = [
-        (ms_band, _shown(points.source_px, alignment.source, ms_band.grid)),
-        (pan_band, _shown(points.reference_px, alignment.reference, pan_band.grid)),
+        (ms_band, _shown(points.source_px, alignment.source.grid, ms_band.grid)),
+        (pan_band, _shown(points.reference_px, alignment.reference.grid, pan_band.grid)),
     ]
     # both panels are one unit high
     widths = [band.data.shape[1] / band.data.shape[0] for band, _ in sides]

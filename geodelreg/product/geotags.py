@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from affine import Affine
 
 from geodelreg.tiff import ASCII, DOUBLE, Directory, Entry, Layout, TiffFile
-from geodelreg.types import Gcp
+from geodelreg.values.points import Gcp
 
 PIXEL_SCALE, TIE_POINTS, TRANSFORMATION = 33550, 33922, 34264
 GEO_KEYS, GEO_DOUBLES, GEO_TEXTS = 34735, 34736, 34737

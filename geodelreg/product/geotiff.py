@@ -24,7 +24,8 @@ from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
 from geodelreg.product.tiffwrite import copy_with_header, is_cog
 from geodelreg.tiff import is_tiff
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 _EXACT_PX = 1e-6
 _REWRITTEN_PX = 1e-4

@@ -18,7 +18,8 @@ from geodelreg.product import geotags, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.srs import SpatialReference, spatial_reference
 from geodelreg.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 Domains = Mapping[str, Mapping[str, str]]
 Metadata = Sequence[Domains]

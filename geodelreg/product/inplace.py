@@ -32,7 +32,8 @@ from geodelreg.product.srs import SpatialReference, is_kept_in_pam, spatial_refe
 from geodelreg.product.tiffwrite import appended_directory, fits, new_pointer
 from geodelreg.product.undo import Edit, SidecarChange, State
 from geodelreg.tiff import TiffFile, is_tiff
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 logger = logging.getLogger(__name__)
 

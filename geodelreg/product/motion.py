@@ -13,7 +13,8 @@ from geodelreg.errors import CrsTransformError
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.grid import gsd_px_m
-from geodelreg.types import Alignment, FloatArray, Grid
+from geodelreg.values.raster import FloatArray, Grid
+from geodelreg.values.result import Alignment
 
 logger = logging.getLogger(__name__)
 
@@ -55,15 +56,16 @@ class HeaderMotion:
 
 def header_motion(alignment: Alignment) -> HeaderMotion:
     """Shift, rotation and scale of an alignment's correction."""
-    correction, source = alignment.correction, alignment.source
+    correction, source = alignment.correction, alignment.source.grid
+    reference = alignment.reference.grid
     height, width = source.shape
     centre = np.array([width / 2, height / 2])
     before = apply_affine(correction.original, centre)
     after = apply_affine(correction.corrected, centre)
     unknown = np.full(2, np.nan)
     try:
-        in_pan = map_points(np.stack([before, after]), source.crs_wkt, alignment.reference.crs_wkt)
-        pan_px = apply_affine(~alignment.reference.transform, in_pan)
+        in_pan = map_points(np.stack([before, after]), source.crs_wkt, reference.crs_wkt)
+        pan_px = apply_affine(~reference.transform, in_pan)
         shift_px = pan_px[1] - pan_px[0]
         metres = _metres_per_unit(source, before)
     except CrsTransformError as error:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from geodelreg import __version__
-from geodelreg.types import Alignment
+from geodelreg.values.result import Alignment
+from geodelreg.version import __version__
 
 _END_BYTES = 1 << 20
 _BLOCK_BYTES = 1 << 16
@@ -66,17 +66,6 @@ def source_date() -> str | None:
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def input_fingerprints(alignment: Alignment) -> dict[str, str]:
-    """`fingerprint` of every input by its path.
-
-    Those in ``alignment.extra["fingerprints"]``, taken when the inputs were read, count more than
-    the files as they are now: an edit in place changes one.
-    """
-    taken = alignment.extra.get("fingerprints", {})
-    paths = (*alignment.source_paths, alignment.reference_path)
-    return {path: taken[path] if path in taken else fingerprint(path) for path in paths}
-
-
 def provenance_tags(alignment: Alignment) -> dict[str, str]:
     """``GEODELREG_*`` tags of a corrected raster; equal inputs and options give equal tags.
 
@@ -90,14 +79,13 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
         Sorted by name; input files without their folders.  What is not known has no tag.
     """
     correction, accuracy = alignment.correction, alignment.accuracy
-    prints = input_fingerprints(alignment)
-    source = [prints[path] for path in alignment.source_paths]
+    source, reference = alignment.source, alignment.reference
     tags = {
         "VERSION": __version__,
-        "MS": "; ".join(Path(path).name for path in alignment.source_paths),
-        "MS_FINGERPRINT": "; ".join(source) if all(source) else "",
-        "PAN": Path(alignment.reference_path).name,
-        "PAN_FINGERPRINT": prints[alignment.reference_path],
+        "MS": "; ".join(Path(path).name for path in source.paths),
+        "MS_FINGERPRINT": "; ".join(source.fingerprints) if all(source.fingerprints) else "",
+        "PAN": Path(reference.paths[0]).name,
+        "PAN_FINGERPRINT": reference.fingerprints[0],
         "MASKS": "; ".join(f"{Path(use.path).name} ({use.kind})" for use in alignment.masks),
         "METHOD": alignment.options.method,
         "MODEL": correction.model,

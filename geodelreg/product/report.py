@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from geodelreg import __version__
 from geodelreg.errors import shown
 from geodelreg.product.motion import HeaderMotion, header_motion
-from geodelreg.product.provenance import input_fingerprints, source_date
-from geodelreg.types import Alignment, Correction, Grid, Outcome, Status, TiePoints
+from geodelreg.product.provenance import source_date
+from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Alignment, Correction, Outcome
+from geodelreg.version import __version__
 
 SCHEMA_VERSION = "1.2"
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
@@ -64,10 +66,11 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "correction": _correction(alignment.correction, header_motion(alignment)),
         "tie_points": _tie_points(alignment.tie_points, tie_points),
         "step_counts": [
-            {"step": step, "points": count} for step, count in alignment.step_counts.items()
+            {"step": step, "points": count}
+            for step, count in alignment.solution.step_counts.items()
         ],
         "accuracy": asdict(alignment.accuracy),
-        "band_weights": dict(alignment.band_weights),
+        "band_weights": dict(alignment.solution.band_weights),
         "masks": [asdict(use) for use in alignment.masks],
         "verdict": {
             "outcome": alignment.verdict.outcome.value,
@@ -97,16 +100,13 @@ def plain(value: Any) -> Any:
 
 
 def _inputs(alignment: Alignment) -> dict[str, Any]:
-    prints = input_fingerprints(alignment)
+    inputs = {"source": alignment.source, "reference": alignment.reference}
     return {
-        "source": {
-            "files": [_file(path, prints[path]) for path in alignment.source_paths],
-            **_grid(alignment.source),
-        },
-        "reference": {
-            "files": [_file(alignment.reference_path, prints[alignment.reference_path])],
-            **_grid(alignment.reference),
-        },
+        role: {
+            "files": [_file(*file) for file in zip(of.paths, of.fingerprints, strict=True)],
+            **_grid(of.grid),
+        }
+        for role, of in inputs.items()
     }
 
 
@@ -144,7 +144,7 @@ def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
     counts = np.bincount(points.status, minlength=len(Status))
     report: dict[str, Any] = {
         "total": len(points),
-        "check": int(np.count_nonzero(points.is_check & points.kept)),
+        "check": 0,  # until schema 2.0: no point is held out of the fit for good
         "by_status": {status.name.lower(): counts[status] for status in Status},
     }
     if listed:
@@ -155,7 +155,7 @@ def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
                 "covariance_px2": points.covariance_px2[index],
                 "score": points.score[index],
                 "status": Status(points.status[index]).name.lower(),
-                "is_check": points.is_check[index],
+                "is_check": False,
                 "residual_px": points.residual_px[index],
             }
             for index in range(len(points))

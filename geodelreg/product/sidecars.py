@@ -166,11 +166,6 @@ def without_placement(pam: bytes, strip_rpc: bool = False) -> bytes | None:
     return _serialise(root) if len(root) else None
 
 
-def has_placement(pam: bytes) -> bool:
-    """Whether a PAM file holds georeferencing, which overrides that inside the raster."""
-    return any(_places(child) for child in _parse(pam))
-
-
 def has_rpc(pam: bytes) -> bool:
     """Whether a PAM file holds RPCs."""
     return any(_is_rpc(child) for child in _parse(pam))

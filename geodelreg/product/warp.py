@@ -27,7 +27,8 @@ from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_c
 from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
 from geodelreg.product.view import corrected_view
-from geodelreg.types import Correction, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Correction
 
 _TOLERANCE_PX = 1e-3
 """Of GDAL's approximation of the way between two CRSs."""

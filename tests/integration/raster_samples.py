@@ -12,7 +12,8 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 from rasterio.shutil import copy as gdal_copy
 
-from geodelreg.types import Correction, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.result import Correction
 
 UTM18 = "EPSG:32618"
 TRANSFORM = Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 4_000_000.0)

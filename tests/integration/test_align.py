@@ -14,7 +14,7 @@ from pyproj import CRS
 
 from benchmarks.scenes.truth import Truth
 from geodelreg import AlignOptions, align
-from geodelreg.types import Alignment, Outcome
+from geodelreg.values.result import Alignment, Outcome
 from tests.integration.align_scenes import (
     SAMPLE,
     Pixels,
@@ -147,14 +147,14 @@ def test_a_band_that_shows_nothing_does_not_matter(tmp_path: Path, empty: int, v
     scene = make_scene(tmp_path, replace(STANDARD, change=blank, nodata=0))
     alignment = align(scene.ms, scene.pan)
     check(scene, alignment, 0.06)
-    assert f"band {empty}" not in alignment.band_weights
+    assert f"band {empty}" not in alignment.solution.band_weights
     assert any(f"band {empty} of MS" in warning for warning in alignment.warnings)
 
 
 def test_the_band_asked_for_is_matched(standard: Scene) -> None:
     alignment = align(standard.ms, standard.pan, AlignOptions(band=2))
     check(standard, alignment, 0.1)
-    assert list(alignment.band_weights) == ["band 2"]
+    assert list(alignment.solution.band_weights) == ["band 2"]
 
 
 @pytest.mark.parametrize("model", ["similarity", "affine"])
@@ -189,8 +189,8 @@ def test_one_file_per_band_gets_the_correction_of_one_file(standard: Scene, tmp_
     together, apart = align(standard.ms, standard.pan), align(files, standard.pan)
     check(standard, apart)
     assert apart.correction.corrected == together.correction.corrected
-    assert apart.source_paths == tuple(map(str, files))
-    assert list(apart.band_weights) == ["B1", "B2", "B3", "B4"]
+    assert apart.source.paths == tuple(map(str, files))
+    assert list(apart.solution.band_weights) == ["B1", "B2", "B3", "B4"]
 
 
 def content(alignment: Alignment) -> bytes:
@@ -201,8 +201,8 @@ def content(alignment: Alignment) -> bytes:
         getattr(points, name).tobytes()
         for name in ("source_px", "reference_px", "covariance_px2", "score", "status")
     ]
-    rest = (plain.correction, plain.accuracy, plain.verdict, dict(plain.step_counts))
-    return pickle.dumps((arrays, repr(rest), dict(plain.band_weights), plain.warnings))
+    rest = (plain.correction, plain.accuracy, plain.verdict, dict(plain.solution.step_counts))
+    return pickle.dumps((arrays, repr(rest), dict(plain.solution.band_weights), plain.warnings))
 
 
 def test_threads_and_runs_change_no_byte(standard: Scene, aligned: Alignment) -> None:

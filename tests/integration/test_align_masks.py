@@ -18,7 +18,7 @@ from geodelreg import AlignOptions, align
 from geodelreg.errors import AlignmentRefusedError, MaskError, NoDataError
 from geodelreg.product.check import check_text
 from geodelreg.product.report import report_dict, report_schema, summary_text
-from geodelreg.types import CheckOutcome, Outcome
+from geodelreg.values.result import CheckOutcome, Outcome
 from tests.integration.align_scenes import (
     PAN_WINDOW,
     UTM18,
@@ -146,7 +146,7 @@ def test_a_quality_band_in_ms_masks_it_and_is_kept(clouded: Clouded, tmp_path: P
         stack.descriptions = ("B1", "B2", "B3", "B4", "QA_PIXEL")
     alignment = align(path, scene.pan)
     assert scene.rmse_px(alignment.correction.corrected) < 0.2
-    assert "QA_PIXEL" not in alignment.band_weights
+    assert "QA_PIXEL" not in alignment.solution.band_weights
     assert [(use.band, use.kind) for use in alignment.masks] == [(5, "landsat-qa")]
     geodelreg.write(alignment, tmp_path / "out.tif")
     with rasterio.open(tmp_path / "out.tif") as out:

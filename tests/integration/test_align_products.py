@@ -22,7 +22,8 @@ from benchmarks.scenes.truth import Truth
 from geodelreg import Alignment, AlignOptions, WriteOptions
 from geodelreg.errors import AlignmentRefusedError, OutputIsInputError
 from geodelreg.product.gcps import read_gcps
-from geodelreg.types import Outcome, Status
+from geodelreg.values.points import Status
+from geodelreg.values.result import Outcome
 from tests.integration.align_scenes import SAMPLE, Recipe, Scene, about, centred, make_scene, write
 
 TURNED = Recipe(
@@ -98,7 +99,7 @@ def test_an_aligned_raster_is_copied_with_its_header(
 def test_in_place_and_back(sample: Scene, aligned: Alignment, tmp_path: Path) -> None:
     copy = shutil.copy(sample.ms, tmp_path / "ms.tif")
     before = copy.read_bytes()
-    geodelreg.write_in_place(replace(aligned, source_paths=(str(copy),)))
+    geodelreg.write_in_place(replace(aligned, source=replace(aligned.source, paths=(str(copy),))))
     assert sample.rmse_px(transform_of(copy)) < 0.02
     geodelreg.revert(copy)
     assert copy.read_bytes() == before
@@ -233,7 +234,7 @@ def alignment_of(refused: AlignmentRefusedError) -> Alignment:
 def test_the_papers_methods_run_and_are_judged(sample: Scene, method: str) -> None:
     """Their points only get fewer, and what is written is right."""
     found = judged(sample, method)
-    counts = list(found.step_counts.items())
+    counts = list(found.solution.step_counts.items())
     assert [name for name, _ in counts[:2]] == ["keypoints MS", "keypoints PAN"]
     points = [number for _, number in counts[2:]]
     assert points == sorted(points, reverse=True)

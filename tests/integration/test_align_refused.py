@@ -19,8 +19,8 @@ from geodelreg.errors import (
     NoDataError,
     NoOverlapError,
 )
-from geodelreg.fit.gate import MAX_RIVAL
-from geodelreg.types import Outcome
+from geodelreg.judge.verdict import MAX_RIVAL
+from geodelreg.values.result import Outcome
 from tests.integration.align_scenes import (
     Bands,
     Pixels,

@@ -11,12 +11,13 @@ import pytest
 import rasterio
 from affine import Affine
 from numpy.typing import NDArray
+from pyproj import CRS
 from rasterio.enums import Resampling
 from scipy import ndimage
 
-from geodelreg import align, check
-from geodelreg.pipeline.state import MOST_BANDS
-from geodelreg.types import Outcome
+from geodelreg import AlignOptions, align, check
+from geodelreg.pair import MOST_BANDS
+from geodelreg.values.result import Outcome
 from tests.integration.align_scenes import (
     Pixels,
     Recipe,
@@ -108,14 +109,14 @@ def test_of_very_many_bands_some_are_matched(standard: Scene, tmp_path: Path) ->
     ms = changed(standard.ms, tmp_path, many, 0)
     alignment = align(ms, standard.pan)
     assert standard.rmse_px(alignment.correction.corrected) < 0.1
-    assert MOST_BANDS / 2 < len(alignment.band_weights) <= MOST_BANDS
+    assert MOST_BANDS / 2 < len(alignment.solution.band_weights) <= MOST_BANDS
     assert any("of 90 bands" in warning for warning in alignment.warnings)
 
 
 def test_one_band_is_enough(standard: Scene, tmp_path: Path) -> None:
     alignment = align(changed(standard.ms, tmp_path, lambda data: data[1:2]), standard.pan)
     assert standard.rmse_px(alignment.correction.corrected) < 0.1
-    assert list(alignment.band_weights) == ["band 1"]
+    assert list(alignment.solution.band_weights) == ["band 1"]
 
 
 @pytest.mark.parametrize("resampling", [Resampling.nearest, Resampling.cubic])
@@ -183,3 +184,17 @@ def test_relief_is_not_passed_over_in_silence(tmp_path: Path) -> None:
     alignment = align(scene.ms, scene.pan)
     assert any("lie elsewhere" in warning for warning in alignment.warnings)
     assert check(scene.ms, scene.pan).affine_enough is not True
+
+
+def test_as_many_keypoints_are_taken_as_are_allowed(tmp_path: Path) -> None:
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((500, 500)), 1.0)
+    data = (2000 + 3000 * noise).astype(np.uint16)[None]
+    crs = CRS.from_epsg(32616).to_wkt()
+    place = Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 1_000_000.0)
+    ms = write(tmp_path / "ms.tif", data, place, crs)
+    pan = write(tmp_path / "pan.tif", data, Affine.translation(4.0, -6.0) @ place, crs)
+    counts = [
+        align(ms, pan, AlignOptions(max_keypoints=most)).solution.step_counts["keypoints PAN"]
+        for most in (1000, 6000, 9000)
+    ]
+    assert counts == [1000, 1500, 2250]

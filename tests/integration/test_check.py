@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 import geodelreg
 from geodelreg.errors import UsageError
-from geodelreg.pipeline.advice import local_distortion, many_elsewhere
-from geodelreg.pipeline.check import is_affine_enough, judge_misalignment
+from geodelreg.fine.layers import many_elsewhere
+from geodelreg.judge.check import is_affine_enough, judge_misalignment
+from geodelreg.judge.words import local_distortion
 from geodelreg.product.check import check_dict, check_text
 from geodelreg.product.report import report_schema
-from geodelreg.types import CheckOutcome, FloatArray, Misalignment, Status, TiePoints
+from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.raster import FloatArray
+from geodelreg.values.result import CheckOutcome, Misalignment
 from tests.cli.helpers import SAMPLES
 
 TRUTH = json.loads((SAMPLES / "truth.json").read_text(encoding="utf-8"))
@@ -134,8 +137,8 @@ def points_of_relief(amplitude_px: float = 1.2, elsewhere_px: float = 3.0) -> Ti
     residual[:, 0] += amplitude_px * np.sin(2 * np.pi * source[:, 1] / 1000)
     residual[600:] = elsewhere_px
     status = np.where(np.arange(900) < 600, Status.KEPT, Status.RESIDUAL).astype(np.uint8)
-    one, no = np.ones(900), np.zeros(900, dtype=bool)
-    return TiePoints(source, source, np.tile(np.eye(2), (900, 1, 1)), one, status, no, residual)
+    covariance = np.tile(np.eye(2), (900, 1, 1))
+    return TiePoints(source, source, covariance, np.ones(900), status, residual)
 
 
 def test_distortion_counts_although_many_lie_elsewhere() -> None:

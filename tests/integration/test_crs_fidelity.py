@@ -24,7 +24,8 @@ from rasterio.io import MemoryFile
 import geodelreg
 from geodelreg import WriteOptions
 from geodelreg.errors import OutputUnwritableError
-from geodelreg.types import Alignment, Correction, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Alignment, Correction
 from tests.integration.crs_zoo import DIFFICULT, zoo
 from tests.unit.alignment_sample import alignment
 

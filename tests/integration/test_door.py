@@ -31,7 +31,7 @@ from geodelreg.image.reader import open_raster
 from geodelreg.options import WriteOptions
 from geodelreg.product.gcps import GcpContext, read_gcps
 from geodelreg.product.geotiff import write_corrected
-from geodelreg.types import Grid, Window
+from geodelreg.values.raster import Grid, Window
 from tests.cli.helpers import COMMAND
 from tests.integration.faults import names
 from tests.integration.loopback import Server

@@ -26,7 +26,7 @@ from geodelreg.options import WriteOptions
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.warp import write_warped
-from geodelreg.types import Grid, Window
+from geodelreg.values.raster import Grid, Window
 from tests.integration.faults import contents
 from tests.integration.raster_samples import (
     ENCODINGS,

@@ -25,7 +25,8 @@ from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.warp import write_warped
-from geodelreg.types import Correction, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Correction
 from geodelreg_cli.main import cli
 from tests.integration.faults import names
 from tests.integration.raster_samples import TRANSFORM, UTM18

@@ -22,7 +22,8 @@ from rasterio.transform import from_gcps
 
 from geodelreg.errors import GcpFormatError, RasterNotFoundError
 from geodelreg.product.gcps import GCP_FORMATS, GcpContext, read_gcps, write_gcps
-from geodelreg.types import Gcp, Grid
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import Grid
 from tests.data.gcps import make
 
 ORACLES = Path(__file__).parents[1] / "data" / "gcps"

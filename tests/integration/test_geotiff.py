@@ -21,7 +21,7 @@ from geodelreg.errors import (
 )
 from geodelreg.options import WriteOptions
 from geodelreg.product.geotiff import write_corrected
-from geodelreg.types import Correction
+from geodelreg.values.result import Correction
 from tests.integration.raster_samples import (
     ENCODINGS,
     GCPS,

@@ -16,7 +16,7 @@ from geodelreg.options import WriteOptions
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place, revert
 from geodelreg.tiff import TiffFile
-from geodelreg.types import Correction
+from geodelreg.values.result import Correction
 from tests.integration.faults import names
 from tests.integration.raster_samples import (
     GCPS,

@@ -31,7 +31,7 @@ from geodelreg.errors import (
     UnsafeInPlaceError,
 )
 from geodelreg.product.inplace import edit_in_place, revert
-from geodelreg.types import Correction, Outcome, Verdict
+from geodelreg.values.result import Correction, Outcome, Verdict
 from tests.integration.faults import (
     contents,
     names,

@@ -22,7 +22,7 @@ from shapely.geometry import mapping
 from geodelreg.errors import MaskError, MissingExtraError
 from geodelreg.image import mask_raster, mask_vector
 from geodelreg.image.reader import open_raster
-from geodelreg.types import BoolArray, Window
+from geodelreg.values.raster import BoolArray, Window
 from tests.conftest import TRANSFORM, UTM16, WriteRaster
 
 UTM17 = "EPSG:32617"

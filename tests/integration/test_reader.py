@@ -15,7 +15,7 @@ from rasterio.env import get_gdal_config, set_gdal_config
 
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.image.reader import check_band, open_raster
-from geodelreg.types import Band, Window
+from geodelreg.values.raster import Band, Window
 from tests.conftest import TRANSFORM, WriteRaster
 
 RNG = np.random.default_rng(7)
@@ -230,11 +230,9 @@ def test_large_blocks_are_named(write_raster: WriteRaster) -> None:
     whole = write_raster("strip.tif", np.zeros((6000, 6000), np.uint16), **strip)
     tiled = write_raster("tiled.tif", TEXTURE, tiled=True, blockxsize=64, blockysize=64)
     with open_raster(whole) as reader:
-        assert reader.is_single_block
         assert "strip.tif" in reader.block_note
         assert "6000 × 6000" in reader.block_note
     with open_raster(tiled) as reader:
-        assert not reader.is_single_block
         assert reader.block_note == ""
 
 

@@ -16,7 +16,7 @@ from rasterio.enums import Resampling
 import geodelreg.image.raster_file
 import geodelreg.image.reader
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Band, Grid, Window
+from geodelreg.values.raster import Band, Grid, Window
 from tests.conftest import WriteRaster
 
 SIZES = [(512, 256), (501, 777), (1570, 391)]
@@ -219,7 +219,7 @@ def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
     script = """
 import resource, sys
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Window
+from geodelreg.values.raster import Window
 with open_raster(sys.argv[1]) as reader:
     reader.read([1], Window(0, 0, 600, 600), (200, 200))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -18,7 +18,7 @@ from geodelreg import errors
 from geodelreg.door.names import ALL
 from geodelreg.errors import GeodelregError
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Window
+from geodelreg.values.raster import Window
 from tests.conftest import WriteRaster
 
 TEXTURE = np.random.default_rng(0).integers(1, 4000, (300, 300)).astype(np.uint16)

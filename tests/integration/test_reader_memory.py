@@ -14,7 +14,7 @@ from affine import Affine
 
 import geodelreg.image.raster_file
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Window
+from geodelreg.values.raster import Window
 
 SIDE = 6144
 PEAK_MB = 100
@@ -24,7 +24,7 @@ CHILD = """
 import json, sys
 import numpy
 from geodelreg.image.reader import open_raster
-from geodelreg.types import Window
+from geodelreg.values.raster import Window
 
 def status(name):
     with open("/proc/self/status") as lines:

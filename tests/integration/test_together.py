@@ -29,7 +29,8 @@ from geodelreg.errors import (
 )
 from geodelreg.product.atomic import staged, tidy, together, write_text_atomically
 from geodelreg.product.inplace import edit_in_place
-from geodelreg.types import Alignment, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Alignment
 from tests.integration.faults import contents, names, restore, run_killed, run_with_error
 from tests.integration.raster_samples import (
     GCPS,

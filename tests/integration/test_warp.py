@@ -22,7 +22,8 @@ from geodelreg.errors import (
 from geodelreg.options import WriteOptions
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.warp import north_up_grid, write_warped
-from geodelreg.types import Correction, Grid
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Correction
 from tests.integration.faults import names
 from tests.integration.raster_samples import (
     GCPS,

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from affine import Affine
 from pyproj import CRS
 
+from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.options import AlignOptions
-from geodelreg.types import (
+from geodelreg.values.points import NO_TIE_POINTS, Status, TiePoints
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import (
     Accuracy,
     Alignment,
-    Correction,
-    Grid,
+    Input,
     Outcome,
     Reason,
-    Status,
-    TiePoints,
+    Solution,
     Verdict,
 )
 
@@ -48,19 +49,22 @@ def tie_points(corrected: Affine = SHIFTED, pan: Affine = PAN_HEADER) -> TiePoin
         covariance_px2=np.tile(np.diag([0.0004, 0.0009]), (5, 1, 1)),
         score=np.array([0.99, 0.98, 0.97, 0.96, 0.4]),
         status=status,
-        is_check=np.array([True, False, False, True, False]),
         residual_px=residual,
     )
 
 
 def alignment(**changes: Any) -> Alignment:
-    """A pair 100 × 80 (MS) and 400 × 320 (PAN), 4:1, whose header was 6 m and 3 m off."""
-    made = Alignment(
-        source=Grid(MS_HEADER, (80, 100), UTM16),
-        reference=Grid(PAN_HEADER, (320, 400), UTM16),
-        source_paths=("scene/ms.tif",),
-        reference_path="scene/pan.tif",
-        correction=Correction("shift", UTM16, MS_HEADER, SHIFTED),
+    """A pair 100 × 80 (MS) and 400 × 320 (PAN), 4:1, whose header was 6 m and 3 m off.
+
+    `changes` are fields of the alignment or of its solution; ``corrected`` is the geotransform that
+    its map makes of the source's.
+    """
+    source = changes.pop("source", Grid(MS_HEADER, (80, 100), UTM16))
+    reference = changes.pop("reference", Grid(PAN_HEADER, (320, 400), UTM16))
+    corrected = changes.pop("corrected", SHIFTED)
+    solution = Solution(
+        model="shift",
+        map=AffineMap(~source.transform @ corrected),
         tie_points=tie_points(),
         accuracy=Accuracy(
             fit_rmse_px=0.04,
@@ -81,8 +85,15 @@ def alignment(**changes: Any) -> Alignment:
         step_counts={"initial": 5, "star": 4},
         band_weights={"red": 0.25, "green": 0.75},
         warnings=("a warning",),
-        crs_operation="",
+    )
+    of_solution = {field.name for field in fields(Solution)} & set(changes)
+    solution = replace(solution, **{name: changes.pop(name) for name in of_solution})
+    made = Alignment(
+        source=Input(("scene/ms.tif",), source, ("",)),
+        reference=Input(("scene/pan.tif",), reference, ("",)),
+        solution=solution,
         options=AlignOptions(),
+        warnings=solution.warnings,
         versions={"geodelreg": "0.1.0", "numpy": "2.0"},
         timings_s={"match": 0.5},
     )
@@ -91,18 +102,10 @@ def alignment(**changes: Any) -> Alignment:
 
 def refused() -> Alignment:
     """Nothing was found: no tie points, an identity correction, unknown accuracy."""
-    empty = np.empty((0, 2))
     return alignment(
-        correction=Correction("none", UTM16, MS_HEADER, MS_HEADER),
-        tie_points=TiePoints(
-            source_px=empty,
-            reference_px=empty,
-            covariance_px2=np.empty((0, 2, 2)),
-            score=np.empty(0),
-            status=np.empty(0, dtype=np.uint8),
-            is_check=np.empty(0, dtype=bool),
-            residual_px=empty,
-        ),
+        model="none",
+        map=IDENTITY,
+        tie_points=NO_TIE_POINTS,
         accuracy=Accuracy(),
         verdict=Verdict(
             Outcome.REFUSED,

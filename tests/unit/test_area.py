@@ -9,7 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from geodelreg.match.area import Overlay, best_shift, rival_correlation
+from geodelreg.coarse.correlation import best_shift
+from geodelreg.fine.overlay import Overlay
+from geodelreg.judge.rival import rival_correlation
 
 Array = NDArray[np.float64]
 SIZE = 240

@@ -8,8 +8,8 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from geodelreg.image.bright import bright_mask, bright_threshold
-from geodelreg.types import Band, Grid
+from geodelreg.fine.layers import bright_mask, bright_threshold
+from geodelreg.values.raster import Band, Grid
 
 SHAPE = (120, 150)
 

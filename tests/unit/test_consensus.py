@@ -7,14 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from geodelreg.match.consensus import (
+from geodelreg.fit.chance import log_nfa
+from geodelreg.fit.consensus import (
     consensus_affine,
     consensus_keypoints,
-    fit_matrix,
+    fit_plainly,
     radial_residuals,
 )
-from geodelreg.match.surprise import log_nfa
-from geodelreg.types import FloatArray, IntArray, Keypoints, Matches
+from geodelreg.geo.affine import affine_matrix
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Keypoints, Matches
+from geodelreg.values.raster import FloatArray, IntArray
 
 SIZE_PX = 1000.0
 
@@ -69,9 +72,10 @@ def one_each(ratio: FloatArray) -> Matches:
     return Matches(index, index, ratio, ratio)
 
 
-def corner_error(found: FloatArray, truth: FloatArray) -> float:
+def corner_error(found: PixelMap | None, truth: FloatArray) -> float:
+    assert found is not None
     corners = np.array([[0.0, 0], [SIZE_PX, 0], [0, SIZE_PX], [SIZE_PX, SIZE_PX]])
-    return float(np.abs(transform(found, corners) - transform(truth, corners)).max())
+    return float(np.abs(found.forward(corners) - transform(truth, corners)).max())
 
 
 @pytest.mark.parametrize("kind", ["similarity", "affine"])
@@ -83,7 +87,7 @@ def test_finds_the_model_and_its_inliers(kind: str, share: float) -> None:
     inliers = int(400 * share)
     source, reference, ratio = contaminated(truth, inliers, 400, seed=1)
     found = consensus_affine(source, reference, ratio, 1.5, seed=3, kind=kind)
-    assert corner_error(found.matrix, truth) < 0.3
+    assert corner_error(found.map, truth) < 0.3
     assert found.inliers[:inliers].mean() > 0.99
     assert found.inliers[inliers:].sum() <= 3
 
@@ -92,7 +96,7 @@ def test_affine_follows_an_anisotropic_model() -> None:
     truth = np.array([[0.5, 0.0, 30.0], [0.0, 1.0, -20.0]])
     source, reference, ratio = contaminated(truth, 60, 150, seed=2)
     found = consensus_affine(source, reference, ratio, 1.5)
-    assert corner_error(found.matrix, truth) < 0.6
+    assert corner_error(found.map, truth) < 0.6
 
 
 def test_good_ratios_are_sampled_first() -> None:
@@ -100,14 +104,16 @@ def test_good_ratios_are_sampled_first() -> None:
     source, reference, ratio = contaminated(truth, 40, 1000, seed=4)
     ratio[:40] -= 0.25
     found = consensus_affine(source, reference, ratio, 1.5)
-    assert corner_error(found.matrix, truth) < 0.8
+    assert corner_error(found.map, truth) < 0.8
 
 
 def test_same_seed_gives_the_same_bytes() -> None:
     arrays = contaminated(similarity(1, 5, 3, 4), 60, 300, seed=5)
     first = consensus_affine(*arrays, 1.5, seed=7)
     again = consensus_affine(*arrays, 1.5, seed=7)
-    assert first.matrix.tobytes() == again.matrix.tobytes()
+    assert first.map is not None
+    assert again.map is not None
+    assert first.map.affine == again.map.affine
     assert first.inliers.tobytes() == again.inliers.tobytes()
 
 
@@ -120,8 +126,8 @@ def test_keypoint_frames_find_8_inliers_among_200() -> None:
         source, reference, ratio = contaminated(truth, 8, 200, seed)
         keypoints = with_frames(source, reference, 8, scale, turn, seed)
         found = consensus_keypoints(*keypoints, one_each(ratio), 1.5, kind="similarity")
-        nfa, _ = log_nfa(radial_residuals(found.matrix, source, reference), SIZE_PX**2, 2)
-        right += corner_error(found.matrix, truth) < 3.0 and nfa < 0
+        nfa, _ = log_nfa(radial_residuals(found.map, source, reference), SIZE_PX**2, 2)
+        right += corner_error(found.map, truth) < 3.0 and nfa < 0
     assert right >= 24
 
 
@@ -131,8 +137,8 @@ def test_positions_alone_find_8_inliers_among_200() -> None:
         truth = similarity(1.1, 30.0 * seed, 50.0, 20.0)
         source, reference, ratio = contaminated(truth, 8, 200, seed)
         found = consensus_affine(source, reference, ratio, 1.5, kind="similarity")
-        nfa, _ = log_nfa(radial_residuals(found.matrix, source, reference), SIZE_PX**2, 2)
-        right += corner_error(found.matrix, truth) < 3.0 and nfa < 0
+        nfa, _ = log_nfa(radial_residuals(found.map, source, reference), SIZE_PX**2, 2)
+        right += corner_error(found.map, truth) < 3.0 and nfa < 0
     assert right >= 9
 
 
@@ -144,9 +150,7 @@ def test_random_matches_say_nothing(kind: str) -> None:
         keypoints = with_frames(source, reference, 0, 1, 0, seed)
         found = consensus_keypoints(*keypoints, one_each(ratio), 1.5, seed, kind)
         size = 2 if kind == "similarity" else 3
-        alarms += (
-            log_nfa(radial_residuals(found.matrix, source, reference), SIZE_PX**2, size)[0] < 0
-        )
+        alarms += log_nfa(radial_residuals(found.map, source, reference), SIZE_PX**2, size)[0] < 0
     assert alarms <= 1
 
 
@@ -166,17 +170,17 @@ def test_matches_that_collapse_to_one_point_are_not_a_model() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_matches_give_nan_and_no_inliers(count: int) -> None:
+def test_too_few_matches_give_no_map_and_no_inliers(count: int) -> None:
     xy = np.arange(2.0 * count).reshape(count, 2)
     found = consensus_affine(xy, xy, np.full(count, 0.5), 1.5)
-    assert np.isnan(found.matrix).all()
+    assert found.map is None
     assert found.inliers.shape == (count,)
     assert not found.inliers.any()
 
 
 def test_collinear_matches_do_not_fix_an_affine() -> None:
     xy = np.stack([np.arange(20.0), 2 * np.arange(20.0)], 1)
-    assert np.isnan(consensus_affine(xy, xy, np.full(20, 0.5), 1.5).matrix).all()
+    assert consensus_affine(xy, xy, np.full(20, 0.5), 1.5).map is None
 
 
 def test_log_nfa_equals_its_formula() -> None:
@@ -207,10 +211,11 @@ def test_log_nfa_ignores_thresholds_beyond_the_limit() -> None:
     assert log_nfa(residual, 1e6, 2, max_residual_px=2.0)[1] == 1.0
 
 
-def test_fit_matrix_recovers_exact_models() -> None:
+def test_a_plain_fit_recovers_exact_models() -> None:
     rng = np.random.default_rng(8)
     xy = rng.uniform(0, SIZE_PX, (12, 2))
     turned = similarity(1.3, 77.0, 12.0, -9.0)
     sheared = np.array([[1.1, 0.2, 5.0], [-0.1, 0.9, -7.0]])
-    np.testing.assert_allclose(fit_matrix(xy, transform(turned, xy), "similarity"), turned)
-    np.testing.assert_allclose(fit_matrix(xy, transform(sheared, xy), "affine"), sheared)
+    for truth, kind in ((turned, "similarity"), (sheared, "affine")):
+        found = fit_plainly(xy, transform(truth, xy), kind)
+        np.testing.assert_allclose(affine_matrix(found.affine), truth)

@@ -15,8 +15,9 @@ from pyproj.transformer import TransformerGroup
 import geodelreg.geo.crs
 from geodelreg.errors import CrsTransformError
 from geodelreg.geo.affine import apply_affine
-from geodelreg.geo.crs import crs_operation, header_mapping, linearise, map_points
-from geodelreg.types import Grid
+from geodelreg.geo.crs import crs_operation, map_points
+from geodelreg.geo.maps.header import header_map
+from geodelreg.values.raster import Grid
 
 UTM17 = CRS.from_epsg(32617).to_wkt()
 UTM18 = CRS.from_epsg(32618).to_wkt()
@@ -42,8 +43,8 @@ def test_equal_crss_leave_points_alone() -> None:
     assert crs_operation(UTM18, UTM18).description == ""
     wkt1 = CRS.from_epsg(32618).to_wkt("WKT1_GDAL")
     assert np.array_equal(map_points(POINTS, UTM18, wkt1), POINTS)
-    assert header_mapping(Grid(Affine.scale(2), (9, 9), UTM18), Grid(Affine.scale(2), (9, 9), wkt1)
-                          ).matrix is not None  # fmt: skip
+    assert header_map(Grid(Affine.scale(2), (9, 9), UTM18), Grid(Affine.scale(2), (9, 9), wkt1)
+                          ).as_affine() is not None  # fmt: skip
 
 
 @pytest.mark.parametrize("wkt", [UTM17, GEOGRAPHIC, CUSTOM], ids=["zone", "geographic", "custom"])
@@ -113,30 +114,31 @@ def test_engineering_crss_have_no_way_out() -> None:
         map_points(POINTS, local, UTM18)
 
 
-def test_header_mapping_is_the_matrix_between_equal_crss() -> None:
+def test_a_header_map_is_affine_between_equal_crss() -> None:
     source = Grid(Affine(40, 1, 437_256.4, 2, -41, 4_176_413.8), (200, 210), UTM18)
     reference = Grid(Affine(10, 0, 437_330, 0, -10, 4_176_460), (800, 810), UTM18)
-    mapping = header_mapping(source, reference)
+    mapping = header_map(source, reference)
     xy = np.random.default_rng(0).uniform(0, 200, (7, 3, 2))
     expected = apply_affine(~reference.transform @ source.transform, xy)
-    assert mapping.matrix is not None
-    assert xy @ mapping.matrix[:, :2].T + mapping.matrix[:, 2] == pytest.approx(expected)
+    affine = mapping.as_affine()
+    assert affine is not None
+    assert apply_affine(affine, xy) == pytest.approx(expected)
     assert mapping.forward(xy) == pytest.approx(expected)
     assert mapping.inverse(expected) == pytest.approx(xy, abs=1e-6)
 
 
-def test_header_mapping_between_zones_is_curved_and_exact() -> None:
+def test_a_header_map_between_zones_is_curved_and_exact() -> None:
     source = Grid(Affine(40, 0, 437_256.4, 0, -40, 4_176_413.8), (2000, 2000), UTM18)
     x, y = Transformer.from_crs(UTM18, UTM17, always_xy=True).transform(437_256.4, 4_176_413.8)
     reference = Grid(Affine(10, 0, x, 0, -10, y), (8000, 8000), UTM17)
-    mapping = header_mapping(source, reference)
-    assert mapping.matrix is None
+    mapping = header_map(source, reference)
+    assert mapping.as_affine() is None
     corners = np.array([[0.0, 0.0], [2000.0, 0.0], [0.0, 2000.0], [2000.0, 2000.0]])
     image = mapping.forward(corners)
     assert image[0] == pytest.approx((0, 0), abs=1e-4)
     assert mapping.inverse(image) == pytest.approx(corners, abs=1e-6)
     assert np.hypot(*(image[1] + image[2] - image[3])) > 1
-    local = linearise(mapping.forward, np.array([[1000.0, 1000.0]]))[0]
+    local = mapping.linearise(np.array([[1000.0, 1000.0]]))[0]
     step = np.array([3.0, -2.0])
     there = mapping.forward(np.array([1000.0, 1000.0]) + step)
     assert local[:, :2] @ step + local[:, 2] == pytest.approx(there, abs=1e-3)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geodelreg.fit.consensus import Consensus, consensus_affine
+from geodelreg.fit.delaunay_mesh import FilterOptions, filter_matches, star_filter, unfolded
+from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.triangulation import delaunay, twice_area
-from geodelreg.match.consensus import Consensus, consensus_affine
-from geodelreg.match.delaunay_filter import FilterOptions, filter_matches, star_filter, unfolded
-from geodelreg.types import BoolArray, FloatArray, Status
+from geodelreg.values.points import Status
+from geodelreg.values.raster import BoolArray, FloatArray
 
 SIZE_PX = 1000.0
 
@@ -104,7 +106,7 @@ def test_nothing_is_kept_of_random_matches() -> None:
         result = filter_matches(*matches)
         rejected += not (result.status == Status.KEPT).any()
         if rejected == seed + 1:
-            assert np.isnan(result.matrix).all()
+            assert result.map is None
             assert result.log10_nfa >= 0
     assert rejected >= 9
 
@@ -119,12 +121,14 @@ def test_status_tells_consensus_from_star() -> None:
     assert result.log10_nfa < -100
 
 
-def test_matrix_is_the_affine_of_the_kept_matches() -> None:
+def test_the_map_is_the_affine_of_the_kept_matches() -> None:
     truth = np.array([[0.98, 0.05, 12.0], [-0.04, 1.01, -7.0]])
     source, _, ratio, right = contaminated(300, 0.4, seed=9)
     reference = source @ truth[:, :2].T + truth[:, 2]
     reference[~right] = np.random.default_rng(9).uniform(0, SIZE_PX, ((~right).sum(), 2))
-    np.testing.assert_allclose(filter_matches(source, reference, ratio).matrix, truth, atol=1e-9)
+    found = filter_matches(source, reference, ratio).map
+    assert found is not None
+    np.testing.assert_allclose(affine_matrix(found.affine), truth, atol=1e-9)
 
 
 def test_given_consensus_is_used() -> None:
@@ -132,7 +136,7 @@ def test_given_consensus_is_used() -> None:
     found = consensus_affine(source, reference, ratio, 8.0)
     given = filter_matches(source, reference, ratio, found=found)
     assert given.status.tolist() == filter_matches(source, reference, ratio).status.tolist()
-    nothing = Consensus(np.full((2, 3), np.nan), np.zeros(300, dtype=np.bool_))
+    nothing = Consensus(None, np.zeros(300, dtype=np.bool_))
     assert (filter_matches(source, reference, ratio, found=nothing).status != Status.KEPT).all()
     assert right.any()
 
@@ -141,7 +145,9 @@ def test_same_input_gives_the_same_bytes() -> None:
     *matches, _ = contaminated(400, 0.6, seed=11)
     first, again = filter_matches(*matches), filter_matches(*matches)
     assert first.status.tobytes() == again.status.tobytes()
-    assert first.matrix.tobytes() == again.matrix.tobytes()
+    assert first.map is not None
+    assert again.map is not None
+    assert first.map.affine == again.map.affine
 
 
 def test_unfolded_leaves_no_point_most_of_whose_triangles_flip() -> None:

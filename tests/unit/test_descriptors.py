@@ -6,15 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from geodelreg.match.descriptors import (
+from geodelreg.coarse.descriptors import (
     match_descriptors,
-    matched_xy,
-    mutual,
     one_to_one,
     ratio_test,
-    select,
 )
-from geodelreg.types import Keypoints
+from geodelreg.values.points import Keypoints
 
 
 def keypoints(count: int, seed: int) -> Keypoints:
@@ -57,7 +54,7 @@ def test_ambiguous_descriptor_has_ratio_one() -> None:
 def test_too_few_keypoints_give_no_matches(sources: int, references: int) -> None:
     matches = match_descriptors(keypoints(sources, 1), keypoints(references, 2))
     assert len(matches) == 0
-    assert len(matched_xy(keypoints(sources, 1), keypoints(references, 2), matches)[0]) == 0
+    assert len(matches.xy(keypoints(sources, 1), keypoints(references, 2))[0]) == 0
 
 
 def test_one_to_one_keeps_the_best_ratio_of_repeated_and_many_to_one_matches() -> None:
@@ -85,18 +82,10 @@ def test_one_to_one_of_nothing() -> None:
     assert len(one_to_one(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))) == 0
 
 
-def test_mutual_matches_are_nearest_both_ways() -> None:
-    source, reference = keypoints(200, 1), keypoints(150, 2)
-    forward, backward = match_descriptors(source, reference), match_descriptors(reference, source)
-    distance = np.linalg.norm(source.descriptors[:, None] - reference.descriptors[None], axis=2)
-    expected = [distance[:, distance[i].argmin()].argmin() == i for i in range(200)]
-    assert mutual(forward, backward).tolist() == expected
-
-
 def test_select_by_mask_and_by_index_agree() -> None:
     matches = match_descriptors(keypoints(20, 1), keypoints(20, 2))
     mask = ratio_test(matches.ratio, 0.97)
-    by_mask, by_index = select(matches, mask), select(matches, np.flatnonzero(mask))
+    by_mask, by_index = matches.take(mask), matches.take(np.flatnonzero(mask))
     assert 0 < len(by_mask) < 20
     assert by_mask.ratio.tolist() == by_index.ratio.tolist()
     assert by_mask.source_index.tolist() == by_index.source_index.tolist()

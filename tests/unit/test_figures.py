@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import MissingExtraError, OutputExistsError, UsageError
 from geodelreg.product.figures import draw_before_after, draw_matches
-from geodelreg.types import Band, Grid, TiePoints
+from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import Band, Grid
 from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, UTM16, alignment
 
 KEPT = np.array([255, 207, 51])

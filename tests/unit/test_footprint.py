@@ -9,7 +9,7 @@ from pyproj import CRS, Transformer
 
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import footprint_in, overlap_windows
-from geodelreg.types import Grid, Window
+from geodelreg.values.raster import Grid, Window
 
 
 def grid(transform: Affine, shape: tuple[int, int], crs: int) -> Grid:

@@ -1,4 +1,4 @@
-"""The gate: every reason refuses by itself, and says what it measured."""
+"""The verdict: every reason refuses by itself, and says what it measured."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from geodelreg.fit import gate
-from geodelreg.fit.gate import Evidence, is_worthwhile, judge, log10_binomial_tail, verdict
+from geodelreg.fit.chance import log10_binomial_tail
+from geodelreg.judge.verdict import Evidence, is_worthwhile, judge, nothing_agrees, verdict
 from geodelreg.options import AlignOptions
-from geodelreg.types import Outcome
+from geodelreg.values.result import Outcome
 
 GOOD = Evidence(
     points=100,
@@ -30,21 +30,20 @@ GOOD = Evidence(
     rival_motion=0.0,
     support=0.95,
     bands_apart=0.1,
+    keypoints_apart=0.0,
 )
+# as docs/method.md tells them
 UPPER = {
-    "log_nfa": gate.MAX_LOG_EACH,
-    "log_chance": gate.MAX_LOG_EACH,
-    "sigma_px": gate.MAX_SIGMA_PX,
-    "disagreement_px": gate.MAX_DISAGREEMENT_PX,
-    "rival": gate.MAX_RIVAL,
-    "rival_motion": gate.MAX_RIVAL_MOTION,
-    "bands_apart": gate.MAX_BANDS_APART,
+    "log_nfa": -2.0,
+    "log_chance": -2.0,
+    "sigma_px": 0.7,
+    "disagreement_px": 1.0,
+    "rival": 0.85,
+    "rival_motion": 0.67,
+    "bands_apart": 0.5,
+    "keypoints_apart": 2.0,
 }
-LOWER = {
-    "points": gate.MIN_POINTS,
-    "coverage": gate.MIN_COVERAGE,
-    "support": gate.MIN_SUPPORT,
-}
+LOWER = {"points": 8, "coverage": 0.05, "support": 0.5}
 ASKED = {
     "shift_px": AlignOptions(max_shift_px=9.0),
     "rotation_deg": AlignOptions(max_rotation_deg=2.0),
@@ -100,7 +99,7 @@ def test_limits_that_were_asked_for_refuse(name: str) -> None:
 
 
 def test_nothing_found_is_a_refusal() -> None:
-    refused = verdict((gate.nothing_agrees(),), moves=True)
+    refused = verdict((nothing_agrees(),), moves=True)
     assert refused.outcome is Outcome.REFUSED
     assert not refused.accepted
 

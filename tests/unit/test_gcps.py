@@ -25,7 +25,8 @@ from geodelreg.product.gcps import (
     write_gcps,
 )
 from geodelreg.product.gcps.envi import projection_info
-from geodelreg.types import Gcp, Grid
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import Grid
 from tests.data.gcps import make
 from tests.unit.alignment_sample import GEOGRAPHIC, SHIFTED, UTM16, UTM17, alignment, tie_points
 
@@ -92,7 +93,7 @@ def test_context_has_the_reference_pixels_in_the_order_of_the_points() -> None:
     context = gcp_context(made)
     assert context.reference_px is not None
     for gcp, pan_px in zip(gcps_from_alignment(made), context.reference_px, strict=True):
-        assert made.reference.transform @ tuple(pan_px) == pytest.approx((gcp.x, gcp.y))
+        assert made.reference.grid.transform @ tuple(pan_px) == pytest.approx((gcp.x, gcp.y))
 
 
 # --- committed files -----------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pyproj import CRS
 
 from geodelreg.errors import CrsTransformError
 from geodelreg.geo.grid import decimated_grid, gsd_px_m, is_north_up, window_transform
-from geodelreg.types import Grid, Window
+from geodelreg.values.raster import Grid, Window
 
 
 def grid(transform: Affine, crs: int | str, shape: tuple[int, int] = (100, 200)) -> Grid:

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from geodelreg.match.keypoints import KeypointOptions, detect
-from geodelreg.types import Keypoints
+from geodelreg.coarse.keypoints import KeypointOptions, detect
+from geodelreg.values.points import Keypoints
 
 
 def texture(height: int, width: int, seed: int = 0, contrast: float = 40.0) -> NDArray[np.uint8]:
@@ -144,9 +144,8 @@ def test_featureless_image_gives_none(shape: tuple[int, int]) -> None:
 def test_large_images_are_looked_at_in_parts_and_lose_nothing() -> None:
     image = texture(900, 1150, seed=8)
     parts = detect(image, everywhere(image), KeypointOptions(max_keypoints=4000))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("geodelreg.match.keypoints._WHOLE_PX", image.size)
-        whole = detect(image, everywhere(image), KeypointOptions(max_keypoints=4000))
+    at_once = KeypointOptions(max_keypoints=4000, whole_px=image.size)
+    whole = detect(image, everywhere(image), at_once)
     assert len(parts) == len(whole) == 4000
 
     def spots(found: Keypoints) -> NDArray[np.float64]:

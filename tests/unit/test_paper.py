@@ -32,9 +32,10 @@ from benchmarks.paper.methods import (
 from benchmarks.paper.scenes import crop_pan
 from benchmarks.scenes.make import Scene
 from benchmarks.scenes.truth import Truth
-from geodelreg.match.zhang2013 import AS_PRINTED, ZhangOptions, match_sift, match_zhang2013
-from geodelreg.pipeline.baseline import grey_keypoints
-from geodelreg.types import Band, Float32Array, Grid, Status, Window
+from geodelreg.paper.baseline import grey_keypoints
+from geodelreg.paper.zhang2013 import AS_PRINTED, ZhangOptions, match_sift, match_zhang2013
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Band, Float32Array, Grid, Window
 
 UTM18 = CRS.from_epsg(32618).to_wkt()
 PAN = Affine(10.0, 0.0, 500_000.0, 0.0, -10.0, 4_000_000.0)

@@ -9,9 +9,12 @@ import pytest
 from affine import Affine
 from numpy.typing import NDArray
 
-from geodelreg.match.refine import Patches, Refined, RefineOptions, cut_patches, refine
-from geodelreg.match.surface import make_surface
-from geodelreg.types import Band, Grid, Status
+from geodelreg.fine.least_squares import Matched, MatchOptions, match_patches
+from geodelreg.fine.patches import Patches, cut_patches
+from geodelreg.fine.surface import make_surface
+from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Band, Grid
 
 Array = NDArray[np.float64]
 
@@ -20,7 +23,7 @@ PER_SIDE = 6
 SIDE = SIZE * PER_SIDE
 MARGIN = 24
 TEMPLATE = Grid(Affine.identity(), (SIDE, SIDE), "")
-OPTIONS = RefineOptions()
+OPTIONS = MatchOptions()
 
 
 @dataclass(frozen=True)
@@ -73,12 +76,14 @@ def seen_by_surface(field: Waves, ratio: float = 1.0) -> Array:
 
 
 def match(
-    patches: Patches, image: Array, ratio: float = 1.0, options: RefineOptions = OPTIONS
-) -> tuple[Refined, Array]:
+    patches: Patches, image: Array, ratio: float = 1.0, options: MatchOptions = OPTIONS
+) -> tuple[Matched, Array]:
     """Match from the place without displacement; the displacements, in template pixels."""
     full = Grid(Affine.identity(), image.shape, "")
     surface = make_surface(as_band(image, full), full, (0.0, 0.0))
-    found = refine(patches, [surface], lambda xy: (xy + MARGIN) * ratio, options)
+    there = AffineMap(Affine.scale(ratio) @ Affine.translation(MARGIN, MARGIN))
+    there = AffineMap(Affine.scale(ratio) @ Affine.translation(MARGIN, MARGIN))
+    found = match_patches(patches, [surface], there, options)
     assert len(found.status) == len(patches)
     return found, found.surface_px / ratio - MARGIN - found.template_px
 
@@ -127,17 +132,14 @@ def test_rotated_and_scaled_mapping_is_followed() -> None:
     image = field.on((centres(330) - offset[0]) / 1.7, (centres(330) - offset[1]) / 1.7)
     surface = make_surface(as_band(image, grid), grid, (0.0, 0.0))
 
-    def mapping(xy: Array) -> Array:
-        u, v = turn @ (xy[..., 0] + 0.3, xy[..., 1] - 0.45)
-        return np.stack([u, v], axis=-1) + offset
-
-    found = refine(patches_of(field.at(x / 1.7, y / 1.7)), [surface], mapping, OPTIONS)
+    there = AffineMap(Affine.translation(*offset) @ turn @ Affine.translation(0.3, -0.45))
+    found = match_patches(patches_of(field.at(x / 1.7, y / 1.7)), [surface], there, OPTIONS)
     u, v = turn @ (found.template_px[:, 0], found.template_px[:, 1])
     assert (found.status == Status.KEPT).all()
     assert np.abs(found.surface_px - np.stack([u, v], axis=1) - offset).max() < 0.005 * 1.7
 
 
-def normalised_error(found: Refined, moved: Array) -> float:
+def normalised_error(found: Matched, moved: Array) -> float:
     """RMS of the errors in units of their own covariances, 1 when those are right."""
     kept = found.status == Status.KEPT
     inverse = np.linalg.inv(found.covariance_px2[kept])

@@ -9,22 +9,19 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy import ndimage
 
+from geodelreg.coarse.scopes import read_overview, scopes
+from geodelreg.fine.layers import Pass, agreement
+from geodelreg.fine.least_squares import Matched
+from geodelreg.fine.looks import preference
+from geodelreg.fine.passes import refine
+from geodelreg.fine.sharpness import lowest
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.models import IDENTITY
-from geodelreg.image.synthetic_pan import single_band
+from geodelreg.fit.models import Frame
+from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.options import AlignOptions
-from geodelreg.pipeline.dense import Dense, Tuning, _concatenate, agreement
-from geodelreg.pipeline.refinement import (
-    Refinement,
-    _is_shift,
-    _preference,
-    refine_densely,
-)
-from geodelreg.pipeline.search import Hypothesis, read_working_pair, scopes
-from geodelreg.pipeline.sharpness import _lowest
-from geodelreg.pipeline.state import make_pair
-from geodelreg.pipeline.tiles import roles
-from geodelreg.types import Band, Grid, Status
+from geodelreg.pair import make_pair, roles
+from geodelreg.values.guess import Guess
+from geodelreg.values.raster import Band, Grid
 from tests.unit.test_gate_evidence import ArrayReader, texture
 
 SIDE = 90
@@ -50,11 +47,13 @@ def test_patches_match_where_every_field_changed_in_its_own_way(seed: int) -> No
     bands = tuple(Band(band.astype(np.float32), valid, grid) for band in ms)
     reference = ArrayReader((Band(pan.astype(np.float32), valid, grid),))
     pair = make_pair(ArrayReader(bands), reference, AlignOptions())
-    images = read_working_pair(pair, next(scopes(pair)))
-    refined = refine_densely(roles(pair), Hypothesis(IDENTITY, float("nan"), {}, images), {})
+    images = read_overview(pair, next(scopes(pair)))
+    refined = refine(roles(pair), Guess(IDENTITY, float("nan"), {}, images))
     assert refined is not None
-    assert (refined.dense.status == Status.KEPT).sum() >= 12
-    np.testing.assert_allclose(refined.matrix[:, 2], -shift, atol=0.15)
+    assert refined.last.kept >= 12
+    middle = pair.source_centre
+    moved = refined.estimate.map.forward(middle) - middle
+    np.testing.assert_allclose(moved[0], -shift, atol=0.15)
 
 
 @pytest.mark.parametrize("factor", [1, 3])
@@ -72,42 +71,41 @@ def test_pixels_of_enlarged_rasters_are_averaged(factor: int) -> None:
 
     source, reference = ArrayReader((band(ms, 1 / factor),)), ArrayReader((band(fine, 0.25),))
     pair = make_pair(source, reference, AlignOptions())
-    images = read_working_pair(pair, next(scopes(pair)))
-    refined = refine_densely(roles(pair), Hypothesis(IDENTITY, float("nan"), {}, images), {})
+    images = read_overview(pair, next(scopes(pair)))
+    refined = refine(roles(pair), Guess(IDENTITY, float("nan"), {}, images))
     assert refined is not None
     assert (refined.part.step > 1) == (factor > 1)
-    assert not refined.is_blurred()
-    np.testing.assert_allclose(refined.matrix, IDENTITY, atol=0.01 * factor)
+    assert not refined.is_blurred
+    corners = pair.source_lattice(2)
+    found = refined.estimate.map.forward(corners)
+    np.testing.assert_allclose(found, corners, atol=0.01 * factor)
 
 
-def test_the_lowest_place_lies_between_its_neighbours() -> None:
-    assert _lowest({0.3: 2.0, 0.4: 1.0, 0.5: 2.0}) == pytest.approx(0.4)
-    assert _lowest(
-        {place: (place - 0.95) ** 2 for place in (0.7, 0.85, 1.0, 1.2)}
-    ) == pytest.approx(0.95)
-    assert _lowest({0.3: 1.0, 0.4: 2.0}) == 0.3
-    assert _lowest({0.3: 1.0, 0.4: 1.0, 0.5: 1.0}) == 0.3
+def test_thelowest_place_lies_between_its_neighbours() -> None:
+    assert lowest({0.3: 2.0, 0.4: 1.0, 0.5: 2.0}) == pytest.approx(0.4)
+    assert lowest({place: (place - 0.95) ** 2 for place in (0.7, 0.85, 1.0, 1.2)}) == pytest.approx(
+        0.95
+    )
+    assert lowest({0.3: 1.0, 0.4: 2.0}) == 0.3
+    assert lowest({0.3: 1.0, 0.4: 1.0, 0.5: 1.0}) == 0.3
 
 
-def refinement(count: int, noise_px: float) -> Refinement:
+def one_pass(count: int, noise_px: float) -> Pass:
     """Of so many patches that agree to within the noise."""
     rng = np.random.default_rng(count)
-    grid = Grid(Affine(2.0, 0.0, 5e5, 0.0, -2.0, 1e6), (SIDE, SIDE), CRS.from_epsg(32616).to_wkt())
-    band = Band(np.zeros(grid.shape, np.float32), np.ones(grid.shape, bool), grid)
-    pair = make_pair(ArrayReader((band,)), ArrayReader((band,)), AlignOptions())
     source = rng.uniform(0, SIDE, (count, 2))
     target = source + rng.normal(0, noise_px, (count, 2))
     covariance = np.tile(np.eye(2) * noise_px**2, (count, 1, 1))
     points, status = Observations(source, target, covariance), np.zeros(count, np.uint8)
-    status, estimate = agreement(roles(pair), points, status, IDENTITY)
-    assert estimate is not None
-    dense = Dense(_concatenate([]), points, status, estimate)
-    return Refinement(roles(pair), [], Tuning(0.5, single_band(1, 0)), dense, IDENTITY, 20)
+    frame = Frame((SIDE / 2, SIDE / 2), SIDE / 2)
+    return Pass(Matched.joined([]), points, *agreement(points, status, IDENTITY, frame, 1.0))
 
 
 def test_a_shift_of_few_patches_is_not_preferred_to_an_affine_of_many() -> None:
-    few, many = refinement(5, 0.02), refinement(30, 0.02)
-    assert _is_shift(few.dense)
-    assert not _is_shift(many.dense)
-    assert _preference(many) < _preference(few)
-    assert _preference(refinement(60, 0.02)) < _preference(many)
+    few, many = one_pass(5, 0.02), one_pass(30, 0.02)
+    assert few.estimate is not None
+    assert many.estimate is not None
+    assert few.estimate.is_shift
+    assert not many.estimate.is_shift
+    assert preference(many) < preference(few)
+    assert preference(one_pass(60, 0.02)) < preference(many)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,9 @@ from geodelreg.fit.models import MODEL_ORDER
 from geodelreg.options import AlignOptions
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import report_dict, report_json, report_schema, summary_text
-from geodelreg.types import Accuracy, Correction, Grid, Outcome, Reason, Status, Verdict
+from geodelreg.values.points import Status
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Accuracy, Outcome, Reason, Verdict
 from tests.unit.alignment_sample import (
     GEOGRAPHIC,
     MS_HEADER,
@@ -110,7 +112,7 @@ def test_geotransforms_are_in_gdal_order() -> None:
 def test_points_are_counted_by_status() -> None:
     points = report_dict(alignment(), tie_points=True)["tie_points"]
     assert points["total"] == 5
-    assert points["check"] == 2
+    assert points["check"] == 0
     assert {name: count for name, count in points["by_status"].items() if count} == {
         "kept": 4,
         "star": 1,
@@ -118,7 +120,7 @@ def test_points_are_counted_by_status() -> None:
     assert points["points"][4]["status"] == "star"
     assert points["points"][4]["residual_px"] == [None, None]
     assert points["points"][0]["source_px"] == [90.5, 70.25]
-    assert points["points"][0]["is_check"] is True
+    assert points["points"][0]["is_check"] is False
 
 
 def test_steps_stay_in_their_order() -> None:
@@ -185,7 +187,7 @@ def test_shift_counts_in_pixels_of_a_rotated_pan() -> None:
 
 
 def test_rotation_is_counterclockwise_on_the_ground() -> None:
-    made = alignment(correction=Correction("similarity", UTM16, MS_HEADER, rotated(0.3)))
+    made = alignment(model="similarity", corrected=rotated(0.3))
     motion = header_motion(made)
     assert motion.rotation_deg == pytest.approx(0.3)
     assert motion.distance_px == pytest.approx(0.0, abs=1e-6)
@@ -193,12 +195,12 @@ def test_rotation_is_counterclockwise_on_the_ground() -> None:
 
 
 def test_rotation_across_the_half_turn() -> None:
-    made = alignment(correction=Correction("similarity", UTM16, MS_HEADER, rotated(-179.5)))
+    made = alignment(model="similarity", corrected=rotated(-179.5))
     assert header_motion(made).rotation_deg == pytest.approx(-179.5)
 
 
 def test_scale_is_along_columns_and_rows() -> None:
-    made = alignment(correction=Correction("affine", UTM16, MS_HEADER, rotated(2.0, (1.01, 0.97))))
+    made = alignment(model="affine", corrected=rotated(2.0, (1.01, 0.97)))
     motion = header_motion(made)
     assert motion.scale == pytest.approx((1.01, 0.97))
     assert motion.rotation_deg == pytest.approx(2.0)
@@ -207,7 +209,7 @@ def test_scale_is_along_columns_and_rows() -> None:
 
 def test_shear_is_the_change_of_the_right_angle() -> None:
     sheared = MS_HEADER @ Affine.shear(0.0, 1.5)
-    motion = header_motion(alignment(correction=Correction("affine", UTM16, MS_HEADER, sheared)))
+    motion = header_motion(alignment(model="affine", corrected=sheared))
     assert abs(motion.shear_deg) == pytest.approx(1.5)
     assert abs(motion.rotation_deg) == pytest.approx(0.75)
 
@@ -218,7 +220,8 @@ def test_metres_of_degrees_come_from_the_ellipsoid() -> None:
     made = alignment(
         source=Grid(header, (80, 100), GEOGRAPHIC),
         reference=Grid(header @ Affine.scale(0.25), (320, 400), GEOGRAPHIC),
-        correction=Correction("shift", GEOGRAPHIC, header, moved),
+        model="shift",
+        corrected=moved,
     )
     motion = header_motion(made)
     geod, (x, y) = Geod(ellps="WGS84"), header @ (50.0, 40.0)
@@ -238,7 +241,8 @@ def test_rotation_on_the_ground_where_degrees_are_unequal() -> None:
     turned = ~to_metres @ Affine.rotation(1.0) @ to_metres @ header
     made = alignment(
         source=Grid(header, (80, 100), GEOGRAPHIC),
-        correction=Correction("similarity", GEOGRAPHIC, header, turned),
+        model="similarity",
+        corrected=turned,
     )
     motion = header_motion(made)
     assert motion.rotation_deg == pytest.approx(1.0, rel=1e-5)
@@ -280,7 +284,7 @@ def test_summary_of_a_shift() -> None:
 
 
 def test_summary_of_a_rotation_names_the_remedies() -> None:
-    text = summary_text(alignment(correction=Correction("affine", UTM16, MS_HEADER, rotated(0.3))))
+    text = summary_text(alignment(model="affine", corrected=rotated(0.3)))
     assert "turned +0.3000° counterclockwise" in text
     assert "--warp" in text
     assert "--model scale" in text
@@ -288,14 +292,16 @@ def test_summary_of_a_rotation_names_the_remedies() -> None:
 
 def test_summary_of_a_raster_that_was_rotated_before() -> None:
     before, after = rotated(5.0), Affine.translation(1.0, 2.0) @ rotated(5.0)
-    text = summary_text(alignment(correction=Correction("shift", UTM16, before, after)))
+    made = alignment(source=Grid(before, (80, 100), UTM16), model="shift", corrected=after)
+    text = summary_text(made)
     assert "--warp" in text
     assert "--model scale" not in text
 
 
 def test_summary_when_nothing_is_to_do() -> None:
     made = alignment(
-        correction=Correction("none", UTM16, MS_HEADER, MS_HEADER),
+        model="none",
+        corrected=MS_HEADER,
         verdict=Verdict(Outcome.ALREADY_ALIGNED),
     )
     first, *_, last = summary_text(made).splitlines()
@@ -312,11 +318,11 @@ def test_summary_of_a_refusal_says_why_and_what_to_try() -> None:
 
 
 def test_summary_without_check_points() -> None:
-    made = replace(alignment(), accuracy=Accuracy(kept=3))
+    made = alignment(accuracy=Accuracy(kept=3))
     assert "3 tie points; too few" in summary_text(made)
 
 
 def test_summary_of_the_sample_uses_its_own_numbers() -> None:
     moved = Affine.translation(120.0, 0.0) @ SHIFTED
-    text = summary_text(alignment(correction=Correction("shift", UTM16, MS_HEADER, moved)))
+    text = summary_text(alignment(model="shift", corrected=moved))
     assert "63.0 px right" in text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -80,7 +81,18 @@ def test_tags_name_inputs_model_accuracy_and_verdict(tmp_path: Path) -> None:
     bands[0].parent.mkdir()
     for path in bands:
         path.write_bytes(path.name.encode())
-    made = alignment(source_paths=tuple(map(str, bands)), reference_path=str(bands[0]))
+    made = alignment()
+    made = replace(
+        made,
+        source=replace(
+            made.source,
+            paths=tuple(map(str, bands)),
+            fingerprints=tuple(map(fingerprint, bands)),
+        ),
+        reference=replace(
+            made.reference, paths=(str(bands[0]),), fingerprints=(fingerprint(bands[0]),)
+        ),
+    )
     tags = provenance_tags(made)
     assert tags["GEODELREG_MS"] == "B2.tif; B3.tif"
     assert tags["GEODELREG_MS_FINGERPRINT"] == "; ".join(map(fingerprint, bands))
@@ -105,9 +117,10 @@ def test_tags_leave_out_what_is_not_known() -> None:
 def test_fingerprints_taken_before_an_edit_in_place_count(tmp_path: Path) -> None:
     path = tmp_path / "ms.tif"
     path.write_bytes(b"before")
-    taken = {str(path): fingerprint(path)}
+    taken = fingerprint(path)
     path.write_bytes(b"after")
-    made = alignment(source_paths=(str(path),), extra={"fingerprints": taken})
-    assert provenance_tags(made)["GEODELREG_MS_FINGERPRINT"] == taken[str(path)]
+    made = alignment()
+    made = replace(made, source=replace(made.source, paths=(str(path),), fingerprints=(taken,)))
+    assert provenance_tags(made)["GEODELREG_MS_FINGERPRINT"] == taken
     file = report_dict(made)["inputs"]["source"]["files"][0]
-    assert file == {"path": str(path), "size_bytes": 5, "fingerprint": taken[str(path)]}
+    assert file == {"path": str(path), "size_bytes": 5, "fingerprint": taken}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geodelreg.fit.neighbourhood import Field, own_stars, predict, stars_of
 from geodelreg.geo.triangulation import delaunay, edges
-from geodelreg.match.star import Field, own_stars, predict, stars_of
-from geodelreg.types import FloatArray
+from geodelreg.values.raster import FloatArray
 
 
 def scattered(count: int, seed: int) -> FloatArray:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from affine import Affine
 
+from geodelreg.coarse.grey import to_uint8
 from geodelreg.errors import NoDataError
-from geodelreg.image.stretch import to_uint8
-from geodelreg.types import Band, Grid
+from geodelreg.values.raster import Band, Grid
 
 
 def band(data: np.ndarray, valid: np.ndarray | None = None, name: str = "") -> Band:

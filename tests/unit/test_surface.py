@@ -8,7 +8,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from geodelreg.match.surface import (
+from geodelreg.fine.surface import (
     high_pass,
     low_pass_taps,
     make_surface,
@@ -16,7 +16,7 @@ from geodelreg.match.surface import (
     sample_patches,
     window_matrix,
 )
-from geodelreg.types import Band, Grid
+from geodelreg.values.raster import Band, Grid
 
 SHAPE = (90, 110)
 INNER = (20.0, 70.0)

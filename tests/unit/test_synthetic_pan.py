@@ -10,14 +10,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from geodelreg.image.synthetic_pan import (
-    SyntheticPan,
-    fit_synthetic_pan,
-    non_negative_weights,
-    robust_band_weights,
-    single_band,
-)
-from geodelreg.types import Band, Grid
+from geodelreg.fine.band_weights import non_negative_weights, robust_band_weights
+from geodelreg.fine.tone import SyntheticPan, fit_synthetic_pan, single_band
+from geodelreg.values.raster import Band, Grid
 
 Array = NDArray[np.float64]
 SHAPE = (80, 100)

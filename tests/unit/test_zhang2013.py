@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from geodelreg.coarse.keypoints import detect
 from geodelreg.geo.triangulation import incircle_sine, interior_edges, relative_altitude
-from geodelreg.match.keypoints import detect
-from geodelreg.match.zhang2013 import (
+from geodelreg.paper.zhang2013 import (
     AS_PRINTED,
     ZhangOptions,
     initial_status,
@@ -24,7 +24,8 @@ from geodelreg.match.zhang2013 import (
     reject_unshared,
     triangulate_kept,
 )
-from geodelreg.types import FloatArray, Keypoints, Status
+from geodelreg.values.points import Keypoints, Status
+from geodelreg.values.raster import FloatArray
 
 TRUTH = np.array([[0.97, -0.12, 40.0], [0.11, 1.02, -25.0]])
 

@@ -14,7 +14,7 @@ from benchmarks.robustness.hostile.plan import Plan
 from benchmarks.robustness.witness import COMMAND
 from geodelreg.errors import GeodelregError
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg.types import Correction
+from geodelreg.values.result import Correction
 
 _PATIENCE_S = 120.0
 """For the command; what is waited for a warm worker is longer."""

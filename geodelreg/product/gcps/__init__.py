@@ -26,7 +26,8 @@ from geodelreg.product.gcps.context import (
     gcp_context,
     reading_order,
 )
-from geodelreg.types import Alignment, Gcp, TiePoints
+from geodelreg.values.points import Gcp, TiePoints
+from geodelreg.values.result import Alignment
 
 __all__ = [
     "GCP_FORMATS",
@@ -87,12 +88,12 @@ def gcps_from_alignment(alignment: Alignment) -> tuple[Gcp, ...]:
     CrsTransformError
         If the two CRSs are not connected.
     """
-    points, reference = alignment.tie_points, alignment.reference
+    points, reference = alignment.tie_points, alignment.reference.grid
     order = reading_order(points)
     ground = map_points(
         apply_affine(reference.transform, points.reference_px[order]),
         reference.crs_wkt,
-        alignment.source.crs_wkt,
+        alignment.source.grid.crs_wkt,
     )
     return tuple(
         Gcp(str(number), column, row, x, y, info=_info(points, int(index)))

@@ -14,7 +14,9 @@ from affine import Affine
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.types import Alignment, FloatArray, Gcp, Grid, IntArray, TiePoints
+from geodelreg.values.points import Gcp, TiePoints
+from geodelreg.values.raster import FloatArray, Grid, IntArray
+from geodelreg.values.result import Alignment
 
 _CRS_TEXT = re.compile(
     r"[A-Za-z]\w*:[\w.]+$|[A-Z]\w+\s*[\[(]|\+|\{|urn:|https?://(www\.)?opengis\.net/def/crs/|"
@@ -71,11 +73,11 @@ def gcp_context(alignment: Alignment) -> GcpContext:
     """Context of `gcps_from_alignment`'s points, in the same order."""
     points = alignment.tie_points
     return GcpContext(
-        source=alignment.source,
+        source=alignment.source.grid,
         corrected=alignment.correction.corrected,
-        reference=alignment.reference,
-        source_paths=alignment.source_paths,
-        reference_path=alignment.reference_path,
+        reference=alignment.reference.grid,
+        source_paths=alignment.source.paths,
+        reference_path=alignment.reference.paths[0],
         reference_px=points.reference_px[reading_order(points)],
     )
 

@@ -26,7 +26,8 @@ from geodelreg.product.gcps.context import (
     pixels_of,
     reference_pixels,
 )
-from geodelreg.types import FloatArray, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import FloatArray
 
 _FIRST_PIXEL = 1.0
 _IMAGE_TITLE = "; ENVI Image to Image GCP File"

@@ -18,7 +18,7 @@ from geodelreg.product.gcps.context import (
     ground_of,
     numbers,
 )
-from geodelreg.types import Gcp
+from geodelreg.values.points import Gcp
 
 _RECORD_SEPARATOR = "\x1e"
 

@@ -20,7 +20,7 @@ from geodelreg.product.gcps.context import (
     numbers,
     one_line,
 )
-from geodelreg.types import Gcp
+from geodelreg.values.points import Gcp
 
 
 def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:

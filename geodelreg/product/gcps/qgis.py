@@ -26,7 +26,8 @@ from geodelreg.product.gcps.context import (
     one_line,
     pixels_of,
 )
-from geodelreg.types import FloatArray, Gcp
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import FloatArray
 
 _CRS_PREFIX = "#CRS: "
 _HEADER = "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"

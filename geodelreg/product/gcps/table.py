@@ -9,7 +9,7 @@ from pathlib import Path
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers
-from geodelreg.types import Gcp
+from geodelreg.values.points import Gcp
 
 _FIELDS = ("id", "info", "column", "line", "x", "y", "z")
 _REQUIRED = ("column", "line", "x", "y")

@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import GcpFormatError, RasterUnreadableError
 from geodelreg.product.gcps.context import Decoded, GcpContext, crs_wkt_of, exact, numbers, one_line
-from geodelreg.types import Gcp
+from geodelreg.values.points import Gcp
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader

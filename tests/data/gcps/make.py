@@ -10,7 +10,8 @@ import rasterio
 from affine import Affine
 
 from geodelreg.product.gcps import GcpContext, write_gcps
-from geodelreg.types import Gcp, Grid
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import Grid
 
 FORMATS = {
     "points.points": "qgis",

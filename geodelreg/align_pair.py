@@ -1,0 +1,206 @@
+"""The whole method: guesses → tie points → map → verdict.  It opens no file and prints nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from geodelreg.coarse.guesses import guesses
+from geodelreg.coarse.scopes import scopes
+from geodelreg.errors import NoOverlapError
+from geodelreg.fine.layers import Claim, on_the_mesh
+from geodelreg.fine.matching import patches_log_nfa, tie_points
+from geodelreg.fine.passes import Refinement, refine
+from geodelreg.fit.choice import Fitted, half_disagreement, select_model
+from geodelreg.fit.models import PARAMETER_COUNT, Frame
+from geodelreg.geo.maps.affine import IDENTITY
+from geodelreg.judge.evidence import gather
+from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, verdict
+from geodelreg.judge.words import warnings_of
+from geodelreg.options import AlignOptions
+from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
+from geodelreg.values.guess import Guess
+from geodelreg.values.points import NO_TIE_POINTS, Status
+from geodelreg.values.raster import WindowReader
+from geodelreg.values.result import Accuracy, Solution
+from geodelreg.values.timings import Timings
+
+_NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
+_FEWEST_POINTS = 4
+_OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
+
+
+class Found(NamedTuple):
+    """What a guess led to: patches around a fitted map."""
+
+    guess: Guess
+    refined: Refinement
+    fitted: Fitted
+
+
+def align_pair(
+    source: WindowReader,
+    reference: WindowReader,
+    options: AlignOptions,
+    progress: Progress | None = None,
+    timings: Timings | None = None,
+) -> tuple[Pair, Solution]:
+    """Find the correction of the source's header, with its evidence.
+
+    Guesses come from keypoints, coarse first, then from edges around the header; each is refined
+    and judged, and the first that the evidence supports is taken.
+
+    Parameters
+    ----------
+    source, reference : WindowReader
+        MS and PAN.
+    options : AlignOptions
+    progress : callable, optional
+        Called with a fraction 0 to 1 and the name of the step.
+    timings : Timings, optional
+        The steps add their seconds to it.
+
+    Returns
+    -------
+    pair : Pair
+    solution : Solution
+        Its verdict may be a refusal; then it is that of the guess that passed most of the gate.
+
+    Raises
+    ------
+    NoOverlapError
+        When headers and contents share no ground.
+    NoDataError
+        When a band has no texture where it matters.
+    """
+    report = progress or (lambda fraction, step: None)
+    pair = make_pair(source, reference, options, timings)
+    refused: list[Solution] = []
+    heard: list[Claim] = []
+    looked = 0.0
+    report(_OPENED, "reading")
+    for seen, guess in pair.timings.each("search", _guesses(pair)):
+        report(_FOUND + looked / 4, "refining")
+        if is_degenerate(guess):
+            continue  # of headers that squeeze the ground to a line
+        found = find(seen, guess)
+        if found is not None:
+            solution = conclude(seen, found, heard)
+            if solution.verdict.accepted:
+                report(1.0, "done")
+                return seen, solution
+            refused.append(solution)
+        heard.append(Claim(guess.map, guess.log_nfa))
+        looked = (1.0 + looked) / 2
+    report(1.0, "refused")
+    return pair, max(refused, key=_passed) if refused else _nothing_found(pair)
+
+
+def _guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:
+    """First guesses; the paper's methods make none, theirs are finished fits."""
+    if pair.options.method == "delaunay":
+        return guesses(pair)
+    from geodelreg.paper.baseline import paper_fits
+
+    return paper_fits(pair)
+
+
+def find(pair: Pair, guess: Guess) -> Found | None:
+    """Tie points and a map from one guess, by the method asked for; None of too few matches."""
+    if pair.options.method == "delaunay":
+        return find_by_patches(pair, guess)
+    from geodelreg.paper.baseline import PaperFit, with_patches
+
+    assert isinstance(guess, PaperFit)
+    found = with_patches(pair, guess)
+    return None if found is None else Found(*found)
+
+
+def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
+    """Patches that agree, without those that the mesh finds out, and the map they choose."""
+    with pair.timings("refine"):
+        refined = refine(roles(pair), guess)
+    if refined is None:
+        return None
+    with pair.timings("fit"):
+        part, last = refined.part, refined.last
+        status = on_the_mesh(last)
+        kept = np.flatnonzero(status == Status.KEPT)
+        points = last.points.take(kept)
+        if len(points) < _FEWEST_POINTS:
+            return None
+        negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
+        frame, model = Frame.of(pair), pair.options.model
+        selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
+        estimate = selection.estimate
+        status[kept[~estimate.inlier]] = Status.RESIDUAL
+        tied = tie_points(part, last.matched, estimate.map, status)
+        counts = {
+            "patches": len(tied),
+            "patches matched": int((last.matched.status == Status.KEPT).sum()),
+            "patches kept": int(tied.kept.sum()),
+        }
+        halves = points.take(estimate.inlier)
+        apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
+        sample_size = PARAMETER_COUNT[estimate.model] // 2
+        fitted = Fitted(
+            selection,
+            tied,
+            guess.counts | counts,
+            patches_log_nfa(part, tied, sample_size),
+            pair.pan_px_per_source_px * apart,
+        )
+    return Found(guess, refined, fitted)
+
+
+def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
+    """Gather the evidence for a map, judge it, and say all that is known."""
+    guess, refined, fitted = found
+    estimate = fitted.selection.estimate
+    with pair.timings("evidence"):
+        accuracy, evidence = gather(guess, refined, fitted, heard)
+        spots = pair.source_lattice(LATTICE)
+        move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
+        sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px
+        moves = is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
+    names = [pair.source.band_names[band - 1] for band in pair.source_bands]
+    return Solution(
+        model=estimate.model,
+        map=fitted.map,
+        tie_points=fitted.points,
+        accuracy=accuracy,
+        verdict=verdict(judge(evidence, pair.options), moves),
+        step_counts=fitted.counts,
+        band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
+        warnings=warnings_of(pair, estimate.model, fitted.points, refined.without_bright),
+    )
+
+
+def is_degenerate(guess: Guess) -> bool:
+    """True when a guess squeezes the ground to a line."""
+    affine = guess.map.as_affine()
+    return affine is not None and affine.is_degenerate
+
+
+def _passed(solution: Solution) -> int:
+    return sum(reason.passed for reason in solution.verdict.reasons)
+
+
+def _nothing_found(pair: Pair) -> Solution:
+    """The refusal when not even a guess could be refined.
+
+    Raises
+    ------
+    NoOverlapError
+        When the headers do not overlap either.
+    """
+    if next(scopes(pair)).is_whole:
+        raise NoOverlapError(
+            f"{pair.source.name} and {pair.reference.name} do not overlap by their headers, and "
+            "their contents do not match",
+            "Check that both show the same ground and that CRSs and geotransforms are right.",
+        )
+    none = verdict((nothing_agrees(),), moves=False)
+    return Solution("none", IDENTITY, NO_TIE_POINTS, Accuracy(), none, {"tie points": 0})

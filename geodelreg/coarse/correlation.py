@@ -1,0 +1,125 @@
+"""Correlation of whole areas: the displacement at which two images fit best.
+
+Masked normalised cross-correlation through the Fourier transform (Padfield 2012,
+doi:10.1109/TIP.2011.2181402).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from geodelreg.fine.overlay import Overlay
+from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
+
+_PIXELS = 90_000  # at most, 300²; unexplained: ablate
+_SEARCH_OVERLAP = 0.15  # of the smaller image; unexplained: ablate
+_HIGH_PASS_SIGMA_PX = 4.0
+_CLIP_SIGMAS = 3.0
+_ALL_VALID = 0.99  # share of a pixel, when decimated; the rest is rounding
+_LEAST_SHARE = 1e-3  # of weight: means of less are not asked for
+_LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
+
+
+def best_shift(overlay: Overlay) -> FloatArray:
+    """Displacement at which the edges of the two images correlate most significantly.
+
+    Of two displacements that of larger overlap may have the smaller correlation and yet be the less
+    likely by chance: what counts is the correlation in units of its own scatter, r √n.
+
+    Parameters
+    ----------
+    overlay : Overlay
+
+    Returns
+    -------
+    (2,) float64
+        (columns, rows): content of `overlay.template` at x is that of `overlay.surface` at x plus
+        this, to about a pixel of the overlay.
+    """
+    details = detail_pair(overlay)
+    (one, one_mask), (other, other_mask) = (_edges(*detail) for detail in details)
+    least = _SEARCH_OVERLAP * float(min(one_mask.sum(), other_mask.sum()))
+    scores, overlap = masked_correlation(one, one_mask, other, other_mask, least)
+    scores *= np.sqrt(np.maximum(overlap, 0.0))
+    row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    height, width = one.shape
+    moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
+    rows, columns = overlay.template.shape
+    return np.asarray(moved * np.array([columns / width, rows / height]))
+
+
+def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Gradient magnitude less its mean: blind to the sign of the contrast."""
+    inner = cv2.erode(mask, np.ones((3, 3), np.uint8))
+    strength = cv2.magnitude(
+        cv2.Sobel(detail, cv2.CV_32F, 1, 0), cv2.Sobel(detail, cv2.CV_32F, 0, 1)
+    )
+    mean = float((strength * inner).sum() / max(float(inner.sum()), 1.0))
+    return np.asarray((strength - mean) * inner, np.float32), np.asarray(inner, np.float32)
+
+
+def detail_pair(
+    overlay: Overlay,
+) -> tuple[tuple[Float32Array, Float32Array], tuple[Float32Array, Float32Array]]:
+    """Template and surface, high-passed, standardised and scaled down, each with its mask."""
+    scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
+    return (
+        _detail(overlay.template, overlay.template_valid, scale),
+        _detail(overlay.surface, overlay.surface_valid, scale),
+    )
+
+
+def _detail(
+    image: Float32Array, valid: BoolArray, scale: float
+) -> tuple[Float32Array, Float32Array]:
+    """High-passed, standardised image, scaled down, with its mask."""
+    weight = valid.astype(np.float32)
+    level = float(image[valid].mean()) if valid.any() else 0.0
+    centred: Float32Array = ((image - np.float32(level)) * weight).astype(np.float32)
+    if scale < 1.0:
+        shape = (max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1))
+        centred = np.asarray(cv2.resize(centred, shape, interpolation=cv2.INTER_AREA), np.float32)
+        weight = np.asarray(cv2.resize(weight, shape, interpolation=cv2.INTER_AREA), np.float32)
+    smooth = cv2.GaussianBlur(centred, (0, 0), _HIGH_PASS_SIGMA_PX)
+    share = cv2.GaussianBlur(weight, (0, 0), _HIGH_PASS_SIGMA_PX)
+    mask = (weight > _ALL_VALID).astype(np.float32)
+    detail = (centred - smooth / np.maximum(share, _LEAST_SHARE)) * mask
+    spread = float(np.sqrt((detail**2).sum() / max(float(mask.sum()), 1.0)))
+    detail = np.clip(detail / max(spread, TINY), -_CLIP_SIGMAS, _CLIP_SIGMAS)
+    return np.asarray(detail, dtype=np.float32), np.asarray(mask, dtype=np.float32)
+
+
+def masked_correlation(
+    one: Float32Array,
+    one_mask: Float32Array,
+    other: Float32Array,
+    other_mask: Float32Array,
+    least_overlap: float,
+) -> tuple[Float32Array, Float32Array]:
+    """(2 H − 1, 2 W − 1) normalised correlation and common pixels of all displacements.
+
+    The correlation is 0 where fewer than `least_overlap` pixels are common.
+    """
+    height, width = one.shape
+    shape = (cv2.getOptimalDFTSize(2 * height - 1), cv2.getOptimalDFTSize(2 * width - 1))
+
+    def spectrum(image: Float32Array) -> Float32Array:
+        padded = np.zeros(shape, dtype=np.float32)
+        padded[:height, :width] = image
+        return np.asarray(cv2.dft(padded))
+
+    def correlate(a: Float32Array, b: Float32Array) -> Float32Array:
+        product = cv2.mulSpectrums(a, b, 0, conjB=True)
+        full = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
+        rolled = np.roll(full, (height - 1, width - 1), axis=(0, 1))
+        return np.asarray(rolled[: 2 * height - 1, : 2 * width - 1])
+
+    mask_a, mask_b = spectrum(one_mask), spectrum(other_mask)
+    overlap = correlate(mask_a, mask_b)
+    together = correlate(spectrum(one), spectrum(other))
+    power_one = correlate(spectrum(one * one), mask_b)
+    power_other = correlate(mask_a, spectrum(other * other))
+    enough = overlap > least_overlap
+    power = np.sqrt(np.maximum(power_one * power_other, _LEAST_POWER))
+    return np.asarray(np.where(enough, together / power, 0.0), dtype=np.float32), overlap

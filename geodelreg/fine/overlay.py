@@ -1,0 +1,91 @@
+"""One image resampled on the other, whole and coarse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from affine import Affine
+
+from geodelreg.fine.surface import Surface, sample
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.pixel import pixel_centres
+from geodelreg.pair import Roles, outline
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid
+
+_WIDEST = 2
+_ROWS = 128  # at a time: positions of 1000 columns take 2 MB
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """Template image and the low-passed surface image resampled on it, coarse.
+
+    Attributes
+    ----------
+    template, surface : (H, W) float32
+    template_valid, surface_valid : (H, W) bool
+        Of each image by itself.
+    """
+
+    template: Float32Array
+    surface: Float32Array
+    template_valid: BoolArray
+    surface_valid: BoolArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """(H, W) bool, True where both are valid."""
+        return self.template_valid & self.surface_valid
+
+    def part(self, rows: slice, columns: slice) -> Overlay:
+        """A window of the overlay."""
+        where = (rows, columns)
+        return Overlay(
+            self.template[where],
+            self.surface[where],
+            self.template_valid[where],
+            self.surface_valid[where],
+        )
+
+
+def overlay(part: Roles, template: Band, surface: Surface, correction: PixelMap) -> Overlay:
+    """Resample a surface onto a (decimated) template window under a correction."""
+    there = part.to_surface(correction)
+    height, width = template.data.shape
+    to_full = ~part.template.grid.transform @ template.grid.transform
+    values = np.empty((height, width), dtype=np.float32)
+    usable = np.empty((height, width), dtype=np.bool_)
+    for top in range(0, height, _ROWS):  # positions need ten times the memory of values
+        some = slice(top, min(top + _ROWS, height))
+        sides = (np.arange(width), np.arange(some.start, some.stop))
+        x, y = to_full @ tuple(np.meshgrid(*(pixel_centres(side) for side in sides)))
+        xy = np.stack([x, y], axis=-1)
+        values[some], usable[some] = sample(surface, there.forward(xy))
+    return Overlay(template.data, values, template.valid, usable)
+
+
+def widened(part: Roles, template: Band, surface: Band, correction: PixelMap) -> Band:
+    """The template band with empty margins where the surface band has more to show.
+
+    A rival place may lie there: of a repeated texture that was aligned too far out, the next period
+    further in.  No margin is more than half as wide as the band.
+    """
+    to_full = ~part.surface.grid.transform @ surface.grid.transform
+    full = apply_affine(to_full, outline(surface.grid, 1))
+    back = ~template.grid.transform @ part.template.grid.transform
+    seen = apply_affine(back, part.to_surface(correction).inverse(full))
+    rows, columns = template.data.shape
+    if not np.isfinite(seen).all():
+        return template
+    low, high = -seen.min(axis=0), seen.max(axis=0) - (columns, rows)
+    limit = (columns // _WIDEST, rows // _WIDEST)
+    left, top = (int(v) for v in np.clip(np.ceil(low), 0, limit))
+    right, bottom = (int(v) for v in np.clip(np.ceil(high), 0, limit))
+    margins = ((top, bottom), (left, right))
+    data, valid = np.pad(template.data, margins), np.pad(template.valid, margins)
+    moved = template.grid.transform @ Affine.translation(-left, -top)
+    return replace(
+        template, data=data, valid=valid, grid=Grid(moved, data.shape, template.grid.crs_wkt)
+    )

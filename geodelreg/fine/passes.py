@@ -1,0 +1,236 @@
+"""From a guess to patches that agree: passes, each with better tone, point spread and map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geodelreg.fine.layers import Pass, ground_alone, is_telling, same_place
+from geodelreg.fine.least_squares import MatchOptions
+from geodelreg.fine.looks import HAZE, PLAIN, SHARPER, Look, preference, sharpest
+from geodelreg.fine.matching import match_pass
+from geodelreg.fine.sharpness import fit_sigma
+from geodelreg.fine.tiles import (
+    Tile,
+    dark_tile,
+    largest_step,
+    overview_tile,
+    patch_size,
+    plan_tiles,
+    read_tiles,
+)
+from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_tone
+from geodelreg.fit.estimate import Estimate
+from geodelreg.geo.maps.affine import IDENTITY
+from geodelreg.pair import Roles, overlap_in_template
+from geodelreg.values.guess import Guess
+from geodelreg.values.maps import PixelMap
+
+COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
+_PASSES = 2
+_PASSES_FROM_AFAR = 3
+_SOME_TILES = 2
+_MANY_TILES = 5  # unexplained: ablate
+_LAST_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
+_LAST_ITERATIONS = 5  # unexplained: ablate
+_FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
+_NEAR_HEADER_PX = 4.0
+_COARSE_FROM = 1.5  # times coarser than full resolution; unexplained: ablate
+_MUCH_VISIBLE = 0.75  # unexplained: ablate
+_BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.sharpness` that is not usual
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """Where the passes ended.
+
+    Attributes
+    ----------
+    part : Roles
+        With the step that suits what the template really shows.
+    tiles : list of Tile
+    tuning : Tuning
+    last : Pass
+        Over all patches; its estimate is not None.
+    size : int
+        Side of a patch, pixels of the tiles' template bands.
+    dark_only : bool
+        The tiles show no bright objects.
+    without_bright : bool
+        Bright objects were left out, because with them the patches agree on something else.
+    """
+
+    part: Roles
+    tiles: list[Tile]
+    tuning: Tuning
+    last: Pass
+    size: int
+    dark_only: bool = False
+    without_bright: bool = False
+
+    @property
+    def estimate(self) -> Estimate:
+        """Of the last pass."""
+        assert self.last.estimate is not None
+        return self.last.estimate
+
+    @property
+    def is_blurred(self) -> bool:
+        """True when larger template pixels would show as much, and enough of them are left."""
+        return self.tuning.sigma > _BLURRED_SIGMA and self.part.step < largest_step(self.part)
+
+
+def refine(part: Roles, guess: Guess) -> Refinement | None:
+    """Passes over well-spread tiles, each with better tone, point spread and map.
+
+    Where the template turns out to be blurred, as rasters are that were enlarged, its pixels are
+    averaged until it no longer is: patches of so many pixels then show more.
+
+    Returns
+    -------
+    Refinement or None
+        None when too few patches match.
+    """
+    near = _coarse_refinement(part, guess)
+    refined = _refine(part, near, guess)
+    while refined is not None and refined.is_blurred:
+        step = part.step * round(refined.tuning.sigma / DEFAULT_SIGMA)
+        part = replace(part, step=min(step, largest_step(part)))
+        coarser = _refine(part, near, guess)
+        if coarser is None:
+            break
+        refined = coarser
+    return refined
+
+
+def _coarse_refinement(part: Roles, guess: Guess) -> PixelMap:
+    """One pass over the decimated pair, where that is much coarser than the template."""
+    tile = overview_tile(part, guess.images)
+    if decimation(tile.template[0], part.template.grid)[0] < _COARSE_FROM:
+        return guess.map
+    if guess.bright is not None:
+        tile = dark_tile(part, tile, guess)
+    tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], guess.map, COARSE_SIGMA))
+    found = match_pass(part, [tile], guess.map, tuning, MatchOptions())
+    return guess.map if found.estimate is None else found.estimate.map
+
+
+def _refine(part: Roles, near: PixelMap, guess: Guess) -> Refinement | None:
+    region = overlap_in_template(part, near)
+    if region is None:
+        return None
+    size = patch_size(region.width * region.height / part.step**2)
+    with part.pair.timings("read tiles"):
+        tiles = read_tiles(part, plan_tiles(region, part), near)
+    return _of_the_ground(part, tiles, guess, near, _size_for(tiles, size)) if tiles else None
+
+
+def _size_for(tiles: list[Tile], size: int) -> int:
+    """Side of a patch, smaller than `size` where much is hidden and few patches would be left."""
+    area = sum(tile.template[0].valid.size for tile in tiles)
+    visible = sum(
+        float(tile.template[0].valid.sum()) * float(tile.surface[0].valid.mean()) for tile in tiles
+    )
+    return min(size, patch_size(visible)) if visible < _MUCH_VISIBLE * area else size
+
+
+def _of_the_ground(
+    part: Roles, tiles: list[Tile], guess: Guess, near: PixelMap, size: int
+) -> Refinement | None:
+    """Refine on all pixels, unless those off bright objects (clouds?) say something else.
+
+    Clouds are bright and smooth, and move; the ground is darker, has sharp edges, and does not.
+    """
+    pair = part.pair
+    everything = _passes(part, tiles, near, size, (PLAIN, *SHARPER))
+    if guess.bright is None:
+        return everything
+    if everything is not None and (everything.is_blurred or everything.last.is_calm):
+        return everything
+    hidden = [dark_tile(part, tile, guess) for tile in tiles]
+    from_header = _is_near_header(part, near)
+    ground = _passes(part, hidden, near, _size_for(hidden, size), (HAZE, PLAIN), from_header)
+    if ground is None or not is_telling(ground.last):
+        return everything
+    ground = replace(ground, dark_only=True)
+    if everything is None or not same_place(pair, ground.last, everything.last):
+        everything = _passes(part, tiles, ground.estimate.map, size, (PLAIN, *SHARPER))
+    if everything is None:
+        return ground
+    if not same_place(pair, ground.last, everything.last):
+        return replace(ground, without_bright=True)
+    return ground if ground_alone(pair, ground.last, everything.last) else everything
+
+
+def _is_near_header(part: Roles, correction: PixelMap) -> bool:
+    """True when the header is so close that patches could find the ground from there."""
+    gap = part.pair.move_px(correction, part.pair.source_lattice(2))
+    return bool(np.hypot(*gap.T).max() < _NEAR_HEADER_PX * part.pan_px_per_patch_px)
+
+
+def _passes(
+    part: Roles,
+    tiles: list[Tile],
+    near: PixelMap,
+    size: int,
+    looks: Sequence[Look],
+    or_header: bool = False,
+) -> Refinement | None:
+    """Passes with the first way to look at the images, then the others if they are sharper.
+
+    Where the first way shows nothing, the second is tried.  All passes but the last go over some of
+    the tiles, if those are enough; with `or_header` they also start from the header, unless nearly
+    all patches agree from the other start, and the start that more patches agree with more closely
+    is taken.
+    """
+    options = MatchOptions(size=size)
+    some = tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
+    starts = [near, IDENTITY] if or_header else [near]
+    passes = _PASSES_FROM_AFAR if or_header else _PASSES
+    best: Refinement | None = None
+    others = looks[1:]
+    tries = [(look, where) for look in looks[:2] for where in (some, tiles)]
+    for look, where in tries if some is not tiles else tries[1::2]:
+        for start in starts:
+            found = _approach(part, where, start, options, look, passes)
+            if found is None:
+                continue
+            if best is None or preference(found.last) < preference(best.last):
+                best, others = found, looks[looks.index(look) + 1 :]
+            if best.last.is_calm:
+                break  # no other start could please more patches
+        if best is not None:
+            break
+    if best is None or best.is_blurred:
+        return best
+    tuning, last = best.tuning, best.last
+    if not last.is_calm:
+        tuning, last = sharpest(part, best.tiles, (tuning, last), others, options)
+    assert last.estimate is not None
+    near = last.estimate.map
+    tuning = replace(tuning, tone=fit_tone(part, tiles, near, tuning.sigma))
+    closely = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
+    last = match_pass(part, tiles, near, tuning, closely)
+    return None if last.estimate is None else Refinement(part, tiles, tuning, last, size)
+
+
+def _approach(
+    part: Roles, tiles: list[Tile], near: PixelMap, options: MatchOptions, look: Look, passes: int
+) -> Refinement | None:
+    """Passes towards the map and the point spread, from a start a few pixels off."""
+    local = look.local_tone and part.ms_is_template
+    sigma, found = DEFAULT_SIGMA, None
+    for number in range(passes):
+        tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
+        tuning = Tuning(sigma, tone, look.high_pass, local)
+        if found is not None and number == 1 and not local:  # without a common tone no sharpness
+            sigma = fit_sigma(part, tiles, found, tuning, options.size)
+            tuning = replace(tuning, sigma=sigma)
+        found = match_pass(part, tiles, near, tuning, options)
+        if found.estimate is None:
+            return None
+        near = found.estimate.map
+    assert found is not None
+    return Refinement(part, tiles, tuning, found, options.size)

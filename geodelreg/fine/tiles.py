@@ -1,0 +1,160 @@
+"""Which windows the refinement visits, and their pixels."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from threading import Lock
+
+import numpy as np
+
+from geodelreg.fine.surface import SPLINE_REACH_PX, Surface, make_surface
+from geodelreg.geo.pixel import pixel_centres
+from geodelreg.pair import Roles, corners_of, window_around
+from geodelreg.values.guess import Guess, Overview
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import Band, BoolArray, Grid, Window
+
+PATCH_PX = 20  # square; unexplained: ablate
+_SPREAD_TILE_PATCHES = 4
+_SPREAD_TILE_PATCHES_FINE = 3
+_FINE_RATIO = 2.5  # unexplained: ablate
+_ADJOINING_TILE_PATCHES = 8  # unexplained: ablate
+_MEMO = 1
+SMALLEST_PATCH_PX = 12  # square; unexplained: ablate
+_WANTED_PATCHES = 40  # five times what the gate asks; unexplained: ablate
+_MOST_TILES_PER_AXIS = 7  # unexplained: ablate
+_USUAL_SIGMA = 0.7  # of a template pixel, the largest point spread that is usual
+_LOW_PASS_REACH = 4.0
+_SLACK_PX = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """Pixels of one place in both images.
+
+    Attributes
+    ----------
+    template : list of Band
+        Of the coarser image: the MS bands, or PAN.
+    surface : list of Band
+        Of the finer image.
+    """
+
+    template: list[Band]
+    surface: list[Band]
+    _memo: dict[tuple[float, float, float], Surface] = field(default_factory=dict, repr=False)
+    _lock: Lock = field(default_factory=Lock, repr=False)
+
+    def low_passed(self, full: Grid, sigma_px: tuple[float, float], high_pass_px: float) -> Surface:
+        """`make_surface` of the first surface band; the last few are remembered."""
+        key = (*sigma_px, high_pass_px)
+        with self._lock:  # several threads may match different bands of one tile
+            if key not in self._memo:
+                while len(self._memo) >= _MEMO:
+                    del self._memo[next(iter(self._memo))]
+                self._memo[key] = make_surface(self.surface[0], full, sigma_px, high_pass_px)
+            return self._memo[key]
+
+
+def largest_step(part: Roles) -> int:
+    """`Roles.step` that leaves pixels for the patches that are wanted."""
+    height, width = part.template.grid.shape
+    least = _WANTED_PATCHES * SMALLEST_PATCH_PX**2
+    return max(int(np.sqrt(height * width / least)), 1)
+
+
+def patch_size(visible_px: float) -> int:
+    """Side of a patch, in template pixels: smaller where few of them are to be seen."""
+    side = np.sqrt(visible_px / _WANTED_PATCHES)
+    return int(np.clip(round(float(side)), SMALLEST_PATCH_PX, PATCH_PX))
+
+
+def plan_tiles(region: Window, part: Roles) -> list[Window]:
+    """Template windows to visit: adjoining where there are few, else spread evenly.
+
+    Tiles of many surface pixels are made smaller, so that all of them fit in memory.
+
+    Parameters
+    ----------
+    region : Window
+        Of the template, as from `geodelreg.pair.overlap_in_template`.
+    part : Roles
+
+    Returns
+    -------
+    list of Window
+        Whole multiples of `Roles.step` wide and high.
+    """
+    step, ratio = part.step, part.surface_px_per_patch_px
+    size = patch_size(region.width * region.height / step**2)
+    patches = _SPREAD_TILE_PATCHES if ratio < _FINE_RATIO else _SPREAD_TILE_PATCHES_FINE
+    columns = _spans(region.column, region.width, size * step, patches)
+    rows = _spans(region.row, region.height, size * step, patches)
+    return [Window(x, y, width, height) for y, height in rows for x, width in columns]
+
+
+def _spans(offset: int, length: int, size: int, patches: int) -> list[tuple[int, int]]:
+    """(start, length) of the tiles along one axis; adjoining ones hold whole patches."""
+    tile = size * patches
+    if length > _MOST_TILES_PER_AXIS * size * _SPREAD_TILE_PATCHES:
+        gaps = np.linspace(0, length - tile, _MOST_TILES_PER_AXIS)
+        return [(offset + round(float(gap)), tile) for gap in gaps]
+    tile, usable = size * _ADJOINING_TILE_PATCHES, length // size * size
+    first = offset + (length - usable) // 2
+    return [(first + start, min(tile, usable - start)) for start in range(0, usable, tile)]
+
+
+def read_tile(part: Roles, window: Window, correction: PixelMap) -> Tile | None:
+    """Read a template window and the surface window around where it should lie."""
+    place = part.to_surface(correction).forward(corners_of(window))
+    if not np.isfinite(place).all():
+        return None
+    ratio = part.surface_px_per_patch_px
+    margin = (_USUAL_SIGMA * _LOW_PASS_REACH + _SLACK_PX) * ratio + SPLINE_REACH_PX
+    around = window_around(place, margin, part.surface.grid)
+    if around is None:
+        return None
+    shape = (window.height // part.step, window.width // part.step)
+    return Tile(
+        part.template.read(part.template_bands, window, shape),
+        part.surface.read(part.surface_bands, around),
+    )
+
+
+def read_tiles(part: Roles, windows: list[Window], correction: PixelMap) -> list[Tile]:
+    """Read planned tiles, in order; those that lie outside the surface raster are left out."""
+    threads = part.pair.threads
+    with part.surface.passing(), part.template.passing(), ThreadPoolExecutor(threads) as pool:
+        tiles = pool.map(lambda window: read_tile(part, window, correction), windows)
+        return [tile for tile in tiles if tile is not None]
+
+
+def overview_tile(part: Roles, images: Overview) -> Tile:
+    """The decimated pair as one tile."""
+    if part.ms_is_template:
+        return Tile(images.source, [images.reference])
+    return Tile([images.reference], images.source)
+
+
+def dark_tile(part: Roles, tile: Tile, guess: Guess) -> Tile:
+    """The tile without the bright objects of a guess that has some."""
+    assert guess.bright is not None
+    source = guess.bright[0], guess.images.source[0].grid
+    reference = guess.bright[1], guess.images.reference.grid
+    template, surface = (source, reference) if part.ms_is_template else (reference, source)
+    return Tile(
+        [_hide(band, *template) for band in tile.template],
+        [_hide(band, *surface) for band in tile.surface],
+    )
+
+
+def _hide(band: Band, mask: BoolArray, mask_grid: Grid) -> Band:
+    """The band with the pixels under a (coarser) mask of the same raster made invalid."""
+    to_mask = ~mask_grid.transform @ band.grid.transform
+    height, width = band.data.shape
+    columns = np.floor(to_mask.a * pixel_centres(np.arange(width)) + to_mask.c).astype(np.intp)
+    rows = np.floor(to_mask.e * pixel_centres(np.arange(height)) + to_mask.f).astype(np.intp)
+    columns = np.clip(columns, 0, mask.shape[1] - 1)
+    rows = np.clip(rows, 0, mask.shape[0] - 1)
+    return replace(band, valid=band.valid & ~mask[np.ix_(rows, columns)])

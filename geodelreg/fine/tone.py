@@ -1,0 +1,191 @@
+"""A synthetic PAN: non-negative weights of the MS bands that best reproduce the low-passed PAN."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fine.band_weights import robust_band_weights
+from geodelreg.values.raster import MAD_TO_SIGMA, TINY, Band, BoolArray, Float32Array, FloatArray
+
+_SLICE = 512  # rows at a time; unexplained: ablate
+_TUKEY_WIDE = 4.0
+_MAX_CURVED_BANDS = 6  # they have 21 products; unexplained: ablate
+_WORTHWHILE = 0.97
+"""Of the spread: three percent of it are worth the curvature; unexplained: ablate."""
+_RANGE_PERCENT = (0.2, 99.8)  # unexplained: ablate
+_TUKEY_ROUNDS = 6  # unexplained: ablate
+_RIDGE = 1e-6  # a sample, of standardised products: nothing beside their noise
+_MOST_FALLING = 0.2  # unexplained: ablate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticPan:
+    """How the MS bands become an image that looks like PAN.
+
+    Attributes
+    ----------
+    weights : (B,) float64
+        Non-negative linear weights.
+    centre, spread, low, high : (B,) float64
+        Of the bands: standardisation and range of the curvature terms.
+    curvature : (B (B + 1) / 2,) float64
+        Weights of the products of standardised bands; zero where linear weights suffice.
+    correlation : float
+        With the low-passed PAN, robustly weighted.
+    """
+
+    weights: FloatArray
+    centre: FloatArray
+    spread: FloatArray
+    low: FloatArray
+    high: FloatArray
+    curvature: FloatArray
+    correlation: float
+
+    def __call__(self, bands: list[Band]) -> Band:
+        """Combine bands of one grid; valid where every band with a weight is."""
+        used = np.flatnonzero((self.weights != 0) | self._curved())
+        data = np.zeros(bands[0].data.shape, dtype=np.float32)
+        valid = np.ones(bands[0].data.shape, dtype=bool)
+        for b in used:
+            data += np.float32(self.weights[b]) * bands[b].data
+            valid &= bands[b].valid
+        if self.curvature.any():
+            stack = np.stack([band.data for band in bands])
+            for term, weight in zip(self._products(stack), self.curvature, strict=True):
+                data += np.float32(weight) * term
+        return Band(data, valid, bands[0].grid, "synthetic PAN")
+
+    def _curved(self) -> BoolArray:
+        return np.full(len(self.weights), bool(self.curvature.any()))
+
+    def _products(self, stack: Float32Array) -> Iterator[Float32Array]:
+        yield from _products(stack, self.centre, self.spread, self.low, self.high)
+
+
+def _products(
+    stack: Float32Array, centre: FloatArray, spread: FloatArray, low: FloatArray, high: FloatArray
+) -> Iterator[Float32Array]:
+    z = [
+        np.asarray((np.clip(values, lo, hi) - mid) / width, dtype=np.float32)
+        for values, lo, hi, mid, width in zip(stack, low, high, centre, spread, strict=True)
+    ]
+    for i, first in enumerate(z):
+        for second in z[i:]:
+            yield first * second
+
+
+def single_band(count: int, index: int) -> SyntheticPan:
+    """One band as it is."""
+    weights = np.zeros(count)
+    weights[index] = 1.0
+    ones, zeros = np.ones(count), np.zeros(count)
+    return SyntheticPan(
+        weights, zeros, ones, zeros, ones, np.zeros(count * (count + 1) // 2), float("nan")
+    )
+
+
+def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan | None:
+    """Fit linear weights robustly, then the curvature that the bands' different tones need.
+
+    A sensor's bands and its PAN differ in gain and tone; with linear weights alone, what curvature
+    is left over pulls the match towards single bands.  Curvature is kept only when it explains
+    held-out samples better.
+
+    Parameters
+    ----------
+    bands : (B, N) float32
+    target : (N,) float32
+        The low-passed PAN at the same places.
+
+    Returns
+    -------
+    SyntheticPan or None
+        None when no band has a positive relation to the target.
+    """
+    weights, correlation = robust_band_weights(bands, target)
+    if not weights.any():
+        return None
+    stack = bands.astype(np.float64)
+    low, high = np.percentile(stack, _RANGE_PERCENT, axis=1)
+    centre, spread = stack.mean(axis=1), np.maximum(stack.std(axis=1), TINY)
+    curvature = np.zeros(len(bands) * (len(bands) + 1) // 2)
+    if len(bands) <= _MAX_CURVED_BANDS:
+        products = np.stack(list(_products(bands, centre, spread, low, high)), axis=1)
+        linear = ((stack - centre[:, None]) / spread[:, None]).T
+        fitted = _curved(products, linear, target - weights @ stack, weights * spread)
+        if fitted is not None:
+            curvature, weights = fitted[0], fitted[1] / spread
+    return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
+
+
+def _curved(
+    products: Float32Array, linear: FloatArray, left: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Curvature and the linear weights beside it, of standardised bands; None to do without.
+
+    Only bands with a positive weight are bent: one that would lose it goes without.
+    """
+    first, second = np.triu_indices(len(weights))
+    constant = np.ones((len(left), 1))
+    free = weights > 0
+    while free.any():
+        used = free[first] & free[second]
+        design = np.column_stack([constant, products[:, used], linear[:, free]])
+        without = left + linear[:, ~free] @ weights[~free]
+        fitted = _tukey_fit(design, without)
+        curvature, steeper = np.zeros(len(first)), np.zeros(len(weights))
+        curvature[used] = fitted[1 : 1 + used.sum()]
+        steeper[free] = weights[free] + fitted[1 + used.sum() :]
+        if (steeper >= 0).all():
+            if _rises(curvature, steeper, linear) and _is_worthwhile(design, without, left):
+                return curvature, steeper
+            return None
+        free &= steeper > 0
+    return None
+
+
+def _rises(curvature: FloatArray, weights: FloatArray, linear: FloatArray) -> bool:
+    """True when brighter bands make the combination brighter, nearly everywhere.
+
+    Curvature that inverts the contrast of a band over part of its range describes changed fields
+    and lighting, not two sensors' tones, and spoils the small contrasts that are matched.
+    """
+    bend = np.zeros((len(weights), len(weights)))
+    bend[np.triu_indices(len(weights))] = curvature
+    slopes = weights + linear @ (bend + bend.T)
+    return bool(np.clip(-slopes, 0, None).sum() <= _MOST_FALLING * np.abs(slopes).sum())
+
+
+def _is_worthwhile(design: FloatArray, target: FloatArray, plain: FloatArray) -> bool:
+    """True when the design explains held-out samples better than a constant does `plain`."""
+    train = np.arange(len(target)) % 2 == 0
+    predicted = design @ _tukey_fit(design[train], target[train])
+    before = _robust_spread((plain - np.median(plain[train]))[~train])
+    return _robust_spread((target - predicted)[~train]) < _WORTHWHILE * before
+
+
+def _robust_spread(values: FloatArray) -> float:
+    return MAD_TO_SIGMA * float(np.median(np.abs(values)))
+
+
+def _tukey_fit(design: FloatArray, target: FloatArray) -> FloatArray:
+    """Least squares by Tukey's biweight from the median absolute residual, a little ridge."""
+    ridge = np.eye(design.shape[1]) * _RIDGE * len(target)
+    trust = np.clip(1 - (target / (_TUKEY_WIDE * _robust_spread(target) + TINY)) ** 2, 0, None)
+    fitted: FloatArray = np.zeros(design.shape[1])
+    for _ in range(_TUKEY_ROUNDS):
+        weighted = design * trust[:, None]
+        normal = ridge + sum(
+            weighted[start : start + _SLICE].T @ design[start : start + _SLICE]
+            for start in range(0, len(target), _SLICE)
+        )
+        moment = np.einsum("nk,n->k", weighted, target)
+        fitted = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
+        residual = target - np.einsum("nk,k->n", design, fitted)
+        scale = _robust_spread(residual)
+        trust = np.clip(1 - (residual / (_TUKEY_WIDE * scale + TINY)) ** 2, 0, None) ** 2
+    return fitted

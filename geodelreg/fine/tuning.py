@@ -1,0 +1,120 @@
+"""What is known about the two sensors, and the images that are matched because of it."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fine.surface import Surface, high_pass, make_surface, sample
+from geodelreg.fine.tiles import Tile
+from geodelreg.fine.tone import SyntheticPan, fit_synthetic_pan, single_band
+from geodelreg.geo.pixel import pixel_centres
+from geodelreg.pair import Roles
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import Band, Float32Array, FloatArray, Grid
+
+DEFAULT_SIGMA = 0.5
+_TONE_SAMPLES = 8_000  # unexplained: ablate
+LEAST_SAMPLES = 64  # unexplained: ablate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tuning:
+    """What refinement knows about the two sensors.
+
+    Attributes
+    ----------
+    sigma : float
+        Gaussian low-pass that brings the finer image to the coarser one's sharpness, in template
+        pixels.
+    tone : SyntheticPan
+    high_pass : float
+        Take off the mean over this standard deviation, in template pixels; 0 = do not.  Haze and
+        changed light are smooth, the ground's edges are not.
+    local_tone : bool
+        Weight the MS bands patch by patch instead of by `tone`; only where MS is the template.
+    """
+
+    sigma: float
+    tone: SyntheticPan
+    high_pass: float = 0.0
+    local_tone: bool = False
+
+
+def surface_sigma(part: Roles, tile: Tile, sigma: float) -> tuple[float, float]:
+    """Low-pass along columns and rows in pixels of the tile's surface bands."""
+    template, surface = tile.template[0], tile.surface[0]
+    ratio = part.surface_px_per_template_px
+    coarse_t = decimation(template, part.template.grid)
+    coarse_s = decimation(surface, part.surface.grid)
+    across, down = (sigma * ratio * t / s for t, s in zip(coarse_t, coarse_s, strict=True))
+    return across, down
+
+
+def decimation(band: Band, full: Grid) -> tuple[float, float]:
+    """Full-raster pixels to one pixel of a band, along columns and rows."""
+    step = ~full.transform @ band.grid.transform
+    return abs(step.a), abs(step.e)
+
+
+def fit_tone(
+    part: Roles, tiles: list[Tile], correction: PixelMap, sigma: float, samples: int = _TONE_SAMPLES
+) -> SyntheticPan:
+    """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
+    there, per_tile = part.to_surface(correction), max(samples // len(tiles), LEAST_SAMPLES)
+
+    def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
+        xy, take = lattice(tile.template[0], part, per_tile)
+        surfaces = _surfaces(part, tile, sigma)
+        place = there.forward(xy)[:, None]
+        fine = [sample(surface, place) for surface in surfaces]
+        good = np.logical_and.reduce([usable[:, 0] for _, usable in fine])
+        good &= np.logical_and.reduce([band.valid[take] for band in tile.template])
+        coarse = np.stack([band.data[take][good] for band in tile.template])
+        smooth = np.stack([v[good, 0] + s.level for (v, _), s in zip(fine, surfaces, strict=True)])
+        return (coarse, smooth[0]) if part.ms_is_template else (smooth, coarse[0])
+
+    with ThreadPoolExecutor(part.pair.threads) as pool:
+        bands, target = zip(*pool.map(samples_of, tiles), strict=True)
+    stacked, goal = np.concatenate(bands, axis=1), np.concatenate(target)
+    fitted = fit_synthetic_pan(stacked, goal) if len(goal) >= LEAST_SAMPLES else None
+    return fitted or single_band(len(stacked), 0)
+
+
+def _surfaces(part: Roles, tile: Tile, sigma: float) -> list[Surface]:
+    low_pass, grid = surface_sigma(part, tile, sigma), part.surface.grid
+    if len(tile.surface) == 1:
+        return [tile.low_passed(grid, low_pass, 0.0)]
+    return [make_surface(band, grid, low_pass) for band in tile.surface]
+
+
+def lattice(
+    band: Band, part: Roles, count: int
+) -> tuple[FloatArray, tuple[np.ndarray, np.ndarray]]:
+    """About `count` pixels of a template band, evenly spread: full-raster centres, and indices."""
+    height, width = band.data.shape
+    step = max(int(np.sqrt(height * width / count)), 1)
+    rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    rows, columns = rows.ravel(), columns.ravel()
+    to_full = ~part.template.grid.transform @ band.grid.transform
+    x, y = to_full @ (pixel_centres(columns), pixel_centres(rows))
+    return np.stack([x, y], axis=1), (rows, columns)
+
+
+def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Surface]:
+    """The template band (or the bands, with local tone) and the surface of a tile."""
+    low_pass, wide = surface_sigma(part, tile, tuning.sigma), 0.0
+    if tuning.high_pass:
+        wide = float(np.mean(surface_sigma(part, tile, tuning.high_pass)))
+    if part.ms_is_template:
+        templates = tile.template if tuning.local_tone else [tuning.tone(tile.template)]
+        surface = tile.low_passed(part.surface.grid, low_pass, wide)
+    else:
+        templates = tile.template[:1]
+        finer = tuning.tone(tile.surface)
+        surface = make_surface(finer, part.surface.grid, low_pass, wide)
+    if tuning.high_pass:
+        templates = [high_pass(band, tuning.high_pass) for band in templates]
+    return templates, surface

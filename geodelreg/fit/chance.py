@@ -1,0 +1,80 @@
+"""How surprising agreement is: the number of false alarms, a contrario, and a binomial tail."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from geodelreg.values.raster import FloatArray, IntArray
+
+_LN_10 = math.log(10)  # between the bases
+_RESIDUAL_FLOOR_PX = 0.1
+"""Positions are no better, and a residual of 0 would prove everything; unexplained: ablate."""
+
+
+def log_nfa(
+    residual_px: FloatArray, area_px2: float, sample_size: int, max_residual_px: float = math.inf
+) -> tuple[float, float]:
+    """Expected number of chance agreements as good as this one (number of false alarms).
+
+    A contrario model: matched points fall anywhere in the reference, uniformly and independently
+    (Moisan & Stival 2004, doi:10.1023/B:VISI.0000013094.38752.5c; the form of Moulon, Monasse &
+    Marlet 2012, doi:10.1007/978-3-642-37447-0_20).  Below 0 (less than one false alarm), agreement
+    is unlikely to be chance; a gate should ask for much less.
+
+    Parameters
+    ----------
+    residual_px : (M,) float64
+        Radial residuals of all one-to-one matches that were available to the search, outliers too.
+    area_px2 : float
+        Area of the reference in which the matches could fall.
+    sample_size : int
+        Matches that fix the model: 1 for a shift, 2 for a similarity, 3 for an affine.
+    max_residual_px : float
+        Largest inlier threshold considered.
+
+    Returns
+    -------
+    log10_nfa : float
+        Minimum over the inlier thresholds; ``inf`` when there are no more matches than
+        `sample_size`.
+    threshold_px : float
+        Where it is reached; NaN when it is not.
+    """
+    residual = np.sort(np.maximum(residual_px, _RESIDUAL_FLOOR_PX))
+    count = len(residual)
+    inliers = np.arange(sample_size + 1, count + 1)
+    inliers = inliers[residual[inliers - 1] <= max_residual_px]
+    if len(inliers) == 0:
+        return math.inf, math.nan
+    probability = np.minimum(np.pi * residual[inliers - 1] ** 2 / area_px2, 1.0)
+    log_counts = (
+        math.log10(count - sample_size)
+        + _log10_choose(count, inliers)
+        + _log10_choose(inliers, sample_size)
+        + (inliers - sample_size) * np.log10(probability)
+    )
+    best = int(log_counts.argmin())
+    return float(log_counts[best]), float(residual[inliers[best] - 1])
+
+
+def log10_binomial_tail(successes: int, trials: int, probability: float) -> float:
+    """log10 of P(X ≥ successes) for a binomial X, far below the smallest float too."""
+    if successes <= trials * probability:
+        return 0.0
+    k = np.arange(successes, trials + 1)
+    odds = math.log10(probability) - math.log10(1.0 - probability)
+    terms = _log10_choose(trials, k) + k * odds + trials * math.log10(1.0 - probability)
+    most = float(terms.max())
+    rest = float(np.exp(_LN_10 * (terms - most)).sum())
+    return min(most + math.log10(rest), 0.0)
+
+
+def _log10_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
+    """log10 of the numbers of ways to choose k of n.
+
+    A sum of logarithms, where scipy.special's gammaln would take 0.2 s to load.
+    """
+    factorial = np.concatenate([[0.0], np.cumsum(np.log10(np.arange(1, np.max(n) + 1)))])
+    return np.asarray(factorial[n] - factorial[k] - factorial[np.subtract(n, k)])

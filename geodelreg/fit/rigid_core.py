@@ -1,0 +1,62 @@
+"""The motion that a fair share of many points has in common to within their noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from geodelreg.fit.consensus import consensus_affine
+from geodelreg.fit.estimate import Observations
+from geodelreg.values.raster import TINY, BoolArray, FloatArray
+
+_CORE_SIGMAS = 1.5  # of the patches' own noise; unexplained: ablate
+_CORE_FLOOR_PX = 0.03  # of a patch pixel; unexplained: ablate
+_GROWTH = 1.5  # of the tolerance from try to try; unexplained: ablate
+_SHIFT_SHARE = 0.15  # unexplained: ablate
+_AFFINE_SHARE = 0.25  # unexplained: ablate
+_CORE_REACH = 2.0
+
+
+def rigid_core(points: Observations, unit: float) -> BoolArray:
+    """Points near the shift, or else the affine, that a fair share fits to within the noise.
+
+    The ground is rigid: its patches agree to within their noise.  Clouds at various heights do not,
+    however many they are.  The tolerance starts at the noise and grows until enough points agree.
+    If they stand out from the others they are the core; over relief, which displaces neighbours
+    alike and no place as it does the next, none do, and all points have their say.
+    """
+    variance = points.covariance[:, 0, 0] + points.covariance[:, 1, 1]
+    tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance))), _CORE_FLOOR_PX * unit)
+    while tolerance <= unit:
+        residuals = list(_rigid_residuals(points, variance, tolerance))
+        shares = [float((np.hypot(*gap.T) <= tolerance).mean()) for gap in residuals]
+        if shares[0] >= max(_SHIFT_SHARE, shares[-1] / 2):
+            return _core(residuals[0], tolerance, variance)
+        if shares[-1] >= _AFFINE_SHARE:
+            return _core(residuals[-1], tolerance, variance)
+        tolerance *= _GROWTH
+    return np.ones(len(points), dtype=bool)
+
+
+def _core(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolArray:
+    """Points around 0, if more lie there than of a normal distribution as wide as theirs."""
+    radius = np.hypot(*residual.T)
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(residual.T)))
+    fair = math.prod(math.erf(tolerance / (math.sqrt(2) * max(s, TINY))) for s in spread)
+    if (radius <= tolerance).mean() < fair:
+        return np.ones(len(radius), dtype=bool)
+    return np.asarray(radius**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
+
+
+def _rigid_residuals(
+    points: Observations, variance: FloatArray, tolerance: float
+) -> Iterator[FloatArray]:
+    """(N, 2) residuals of the best shift of the header, then of the best affine."""
+    move = points.target - points.source
+    near = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1)) <= tolerance
+    yield move - move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
+    found = consensus_affine(points.source, points.target, variance, tolerance, kind="affine")
+    if found.map is not None:
+        yield points.target - found.map.forward(points.source)

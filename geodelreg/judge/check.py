@@ -1,0 +1,63 @@
+"""How far off a raster lies, and whether that is more than is tolerated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from geodelreg.fine.layers import LOCAL_RMS_PX, many_elsewhere
+from geodelreg.judge.verdict import SIGNIFICANCE
+from geodelreg.judge.words import local_distortion
+from geodelreg.pair import Pair, overlap_corners, roles
+from geodelreg.values.points import TiePoints
+from geodelreg.values.result import CheckOutcome, Misalignment, Solution
+
+
+def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
+    """Largest displacement over the overlap; a refused solution knows none.
+
+    An affine displacement is longest at a corner, and so is its standard error.
+    """
+    if not solution.verdict.accepted:
+        return Misalignment()
+    corners = overlap_corners(roles(pair), solution.map)
+    moves = pair.move_px(solution.map, corners)
+    return Misalignment(
+        distance_px=float(np.hypot(*moves.T).max()),
+        distance_m=float(np.hypot(*(moves * np.array(pair.reference_gsd_m)).T).max()),
+        sigma_px=solution.accuracy.sigma_corner_px,
+        local_px=local_distortion(solution.tie_points),
+    )
+
+
+def judge_misalignment(misalignment: Misalignment, limit_px: float) -> CheckOutcome:
+    """Misaligned when significantly more than `limit_px` off, in whole or locally.
+
+    Otherwise aligned, provided that the measurement is sharp enough to have shown a misalignment of
+    the limit's size.
+
+    Parameters
+    ----------
+    misalignment : Misalignment
+    limit_px : float
+        PAN pixels.
+    """
+    doubt = SIGNIFICANCE * misalignment.sigma_px
+    if math.isnan(doubt):
+        return CheckOutcome.CANNOT_TELL
+    if misalignment.distance_px - doubt > limit_px or misalignment.local_px > limit_px:
+        return CheckOutcome.MISALIGNED
+    return CheckOutcome.ALIGNED if doubt <= limit_px else CheckOutcome.CANNOT_TELL
+
+
+def is_affine_enough(misalignment: Misalignment, limit_px: float, points: TiePoints) -> bool | None:
+    """False when a local warp is needed for `limit_px`; None when nothing can be told.
+
+    Nothing can, unless distorted, when few points agree or many lie elsewhere.
+    """
+    if math.isnan(misalignment.local_px):
+        return None
+    if misalignment.local_px > min(LOCAL_RMS_PX, limit_px):
+        return False
+    return None if many_elsewhere(points) else True

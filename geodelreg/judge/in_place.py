@@ -1,0 +1,147 @@
+"""Whether patches resemble the other image best just where the correction puts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fine.least_squares import MIN_CORRELATION, MIN_VALID
+from geodelreg.fine.patches import Patches, cut_patches, sample_step
+from geodelreg.fine.surface import Surface, sample
+from geodelreg.fine.tiles import Tile
+from geodelreg.fine.tuning import Tuning, tile_images
+from geodelreg.fit.chance import log10_binomial_tail
+from geodelreg.geo.pixel import pixel_centres
+from geodelreg.pair import Roles
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import FloatArray, IntArray
+
+_DISPLACED_RADII = (4.0, 9.0)  # patch pixels: beyond the texture's own width; unexplained: ablate
+_DIRECTIONS = 8  # at each radius: 16 places
+_BY_CHANCE = 0.125  # twice 1/17: the best of 17 like places; unexplained: ablate
+_TESTED_PATCHES = 160  # unexplained: ablate
+_LEAST_DISPLACED = 8  # half of the places
+_RESEMBLES = MIN_CORRELATION**2  # share of the variance that is explained
+
+
+@dataclass(frozen=True, slots=True)
+class AreaEvidence:
+    """How areas correlate where the correction puts them.
+
+    Attributes
+    ----------
+    tested, best_in_place : int
+        Textured patches, and those that correlate better in place than at any displaced place.
+    alike, alike_in_place : int
+        The same of patches that resemble the other image at any of the places.
+    log_chance : float
+        log10 of the probability of `best_in_place` by chance.
+    """
+
+    tested: int = 0
+    best_in_place: int = 0
+    alike: int = 0
+    alike_in_place: int = 0
+
+    @property
+    def log_chance(self) -> float:
+        """log10 P(as many by chance)."""
+        return log10_binomial_tail(self.best_in_place, self.tested, _BY_CHANCE)
+
+    @property
+    def support(self) -> float:
+        """Share of the patches that resemble something that do so best in place; NaN of none."""
+        return self.alike_in_place / self.alike if self.alike else float("nan")
+
+    def plus(self, other: AreaEvidence) -> AreaEvidence:
+        """Of both together."""
+        return AreaEvidence(
+            self.tested + other.tested,
+            self.best_in_place + other.best_in_place,
+            self.alike + other.alike,
+            self.alike_in_place + other.alike_in_place,
+        )
+
+
+def area_evidence(
+    part: Roles, tiles: list[Tile], correction: PixelMap, tuning: Tuning, size: int, few: bool
+) -> AreaEvidence:
+    """Compare correlation in place with that at displaced places, patch by patch.
+
+    Parameters
+    ----------
+    part, tiles, correction, tuning
+        As for `geodelreg.fine.matching.match_pass`.
+    size : int
+        Side of a patch, template pixels.
+    few : bool
+        Test a sample of the patches instead of all.
+    """
+    angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
+    every = sample_step([tile.template[0] for tile in tiles], size, _TESTED_PATCHES) if few else 1
+    there, found = part.to_surface(correction), AreaEvidence()
+    for number, tile in enumerate(tiles):
+        bands, surface = tile_images(part, tile, tuning)
+        patches = cut_patches(bands, part.template.grid, size)
+        chosen = np.arange(number % every, len(patches), every)
+        scores = _explained(there, surface, patches, chosen, offsets)
+        found = found.plus(best_in_place(scores))
+    return found
+
+
+def best_in_place(scores: FloatArray) -> AreaEvidence:
+    """Count the patches that score best in place.
+
+    Parameters
+    ----------
+    scores : (P, K) float64
+        In place first, then at displaced places; NaN where a place cannot be seen.
+    """
+    seen = np.isfinite(scores)
+    enough = seen[:, 0] & (seen[:, 1:].sum(axis=1) >= _LEAST_DISPLACED)
+    ranked = np.where(seen[enough], scores[enough], -np.inf)
+    if not len(ranked):
+        return AreaEvidence()
+    best = ranked.argmax(axis=1) == 0
+    alike = ranked.max(axis=1) >= _RESEMBLES
+    return AreaEvidence(len(best), int(best.sum()), int(alike.sum()), int((best & alike).sum()))
+
+
+def _explained(
+    to_surface: PixelMap, surface: Surface, patches: Patches, chosen: IntArray, offsets: FloatArray
+) -> FloatArray:
+    """(P, K) share of the surface's variance that the bands explain, per patch and offset.
+
+    NaN where too little of the patch lies on the surface; patches without texture are left out.
+    """
+    size = patches.size
+    picked = np.arange(0, size, 2)
+    axis = pixel_centres(picked) - size / 2.0
+    grid_x, grid_y = np.meshgrid(axis, axis)
+    inside = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
+    take = (picked[:, None] * size + picked[None, :]).ravel()
+    spots = (offsets[:, None, :] + inside[None]).reshape(-1, 2) * patches.step
+    xy = patches.centre[chosen][:, None, :] + spots[None]
+    there, usable = sample(surface, to_surface.forward(xy))
+    shape = (len(chosen), len(offsets), len(take))
+    seen = usable.reshape(shape) & patches.valid[chosen][:, None, take]
+    weight = seen.astype(np.float64)[:, :, None]
+    values = patches.values[chosen][:, None, :, take]
+    alike = bool((seen == seen[:, :1]).all())  # then one basis serves all offsets
+    bands = _centred(values.astype(np.float64), weight[:, :1] if alike else weight)
+    image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
+    basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
+    explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
+    energy = (image**2).sum(axis=(2, 3))
+    good = seen.mean(axis=2) > MIN_VALID
+    good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
+    return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
+
+
+def _centred(values: FloatArray, weight: FloatArray) -> FloatArray:
+    total = np.maximum(weight.sum(axis=-1, keepdims=True), 1.0)
+    mean = (values * weight).sum(axis=-1, keepdims=True) / total
+    return np.asarray((values - mean) * weight)

@@ -1,0 +1,108 @@
+"""Whether the images would fit as well elsewhere: repeated texture does, one period further."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from geodelreg.coarse.correlation import detail_pair, masked_correlation
+from geodelreg.fine.overlay import Overlay
+from geodelreg.values.raster import Float32Array, FloatArray
+
+_NEAR_PX = 8  # unexplained: ablate
+_PEAK_PX = 3
+_LEAST_COMMON = 1000  # pixels; unexplained: ablate
+_LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
+_RIVALS = 5  # unexplained: ablate
+_RIVAL_OVERLAP = 0.2  # unexplained: ablate
+_BLOCK_PX = 32  # of the image magnified twice
+_UNSUSPICIOUS = 0.5
+
+
+def rival_correlation(overlay: Overlay) -> float:
+    """Best correlation at another displacement over that in place; 0 to about 1.
+
+    Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
+    that the images alone cannot tell.  Rivals are the displacements at which the whole correlates
+    best; they are judged block by block, so that fields of inverted contrast do not cancel out.
+
+    Returns
+    -------
+    float
+        NaN when the overlay is too small or has no texture.
+    """
+    (one, one_mask), (other, other_mask) = detail_pair(overlay)
+    height, width = one.shape
+    small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
+    common = float((one_mask * other_mask).sum())
+    if small or common < _LEAST_COMMON:
+        return float("nan")
+    signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
+    scores = np.abs(signed)
+    middle_y, middle_x = height - 1, width - 1
+    reach = 1
+    here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
+    in_place = float(here.max())
+    if in_place <= 0:
+        return float("inf")
+    near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
+    scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
+    rivals: list[float] = []
+    by_block: Callable[[int, int], float] | None = None
+    for _ in range(_RIVALS):
+        row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
+        ratio = float(scores[row, column]) / in_place
+        if ratio < _UNSUSPICIOUS:
+            rivals.append(ratio)
+            break
+        by_block = by_block or _rival_blocks(one, other)
+        in_blocks = by_block(middle_y - row, middle_x - column)
+        rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
+        scores[_around(row, _PEAK_PX), _around(column, _PEAK_PX)] = 0.0
+    return max(rivals)
+
+
+def _around(centre: int, reach: int) -> slice:
+    return slice(max(centre - reach, 0), centre + reach + 1)
+
+
+def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int], float]:
+    """Like `rival_correlation`, of the blocks' correlations with any sign, for a displacement.
+
+    Displacements are tried to half a pixel, so that a period of no whole number fits; NaN where
+    no block can be compared.
+    """
+    finer = [cv2.resize(i, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for i in (one, other)]
+    first, second = (np.asarray(image, np.float32) for image in finer)
+    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
+
+    def best(dy: int, dx: int) -> float:
+        return max(_block_correlation(first, second, (2 * dy + y, 2 * dx + x)) for y, x in around)
+
+    here = best(0, 0)
+    return lambda dy, dx: best(dy, dx) / here if here > 0 else float("nan")
+
+
+def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
+    """Root mean square correlation of blocks of `one` with `other` at (rows, columns) further."""
+    height, width = one.shape
+    dy, dx = moved
+    first = one[max(-dy, 0) : min(height - dy, height), max(-dx, 0) : min(width - dx, width)]
+    second = other[max(dy, 0) : min(height + dy, height), max(dx, 0) : min(width + dx, width)]
+    a, b = _blocks(first), _blocks(second)
+    power = (a**2).sum(axis=1) * (b**2).sum(axis=1)
+    textured = power > _LEAST_POWER
+    if not textured.any():
+        return float("nan")
+    return float(np.sqrt(((a * b).sum(axis=1)[textured] ** 2 / power[textured]).mean()))
+
+
+def _blocks(image: Float32Array) -> FloatArray:
+    """(N, n²) blocks less their means."""
+    rows, columns = (side // _BLOCK_PX for side in image.shape)
+    cut = image[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
+    parts = cut.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).swapaxes(1, 2)
+    values = parts.reshape(rows * columns, _BLOCK_PX**2).astype(np.float64)
+    return np.asarray(values - values.mean(axis=1, keepdims=True))

@@ -1,0 +1,90 @@
+"""What a user should know about a solution beyond its figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
+from geodelreg.fit.choice import spatial_blocks
+from geodelreg.pair import Pair, bands_asked
+from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import FloatArray
+
+_LOCAL_SIGNIFICANCE = 3.0
+_MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
+_BLOCKS = 4
+_LEAST_PER_BLOCK = 4
+
+
+def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool) -> tuple[str, ...]:
+    """What a user should be warned of, in plain words.
+
+    Parameters
+    ----------
+    pair : Pair
+    model : str
+        Of the correction.
+    points : TiePoints
+        With residuals under the correction.
+    without_bright : bool
+        Bright objects were left out, because they move differently.
+    """
+    notes: list[str] = []
+    if not pair.source_is_coarser:
+        notes.append(
+            f"MS pixels ({pair.source_gsd_m[0]:.4g} m) are finer than the reference's "
+            f"({pair.reference_gsd_m[0]:.4g} m): matched at the reference's resolution"
+        )
+    if pair.header.operation.warning:
+        notes.append(pair.header.operation.warning)
+    names, asked = pair.source.band_names, bands_asked(pair.source, pair.options)
+    if len(asked) < len(names) and not pair.options.band:
+        notes.append(f"{len(asked)} of {len(names)} bands of MS, evenly spread, were looked at")
+    left_out = [names[number - 1] for number in asked if number not in pair.source_bands]
+    if left_out:
+        notes.append(f"{', '.join(left_out)} of MS showed too little to be matched on")
+    if without_bright:
+        notes.append("bright objects (clouds?) move differently from the ground and were left out")
+    if model in ("similarity", "affine"):
+        notes.append(
+            "the correction rotates the raster: its geotransform is no longer north-up, which "
+            "GDAL's pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
+        )
+    local = local_distortion(points)
+    if local > LOCAL_RMS_PX:
+        notes.append(
+            f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
+            "(terrain, or bands that do not agree); a local warp would be needed"
+        )
+    if many_elsewhere(points):
+        share, distance = elsewhere(points)
+        notes.append(
+            f"{share:.0%} of the patches that matched lie elsewhere, {distance:.2g} PAN px off in "
+            "the median (terrain, clouds, or changes): the correction and its standard error are "
+            "those of the others; over terrain a local warp would be needed"
+        )
+    return tuple(notes)
+
+
+def local_distortion(points: TiePoints) -> float:
+    """RMS of what is left over smoothly, in PAN pixels; 0 when it is within the noise.
+
+    Residuals are averaged over blocks; their variance beyond that of the noise is distortion.
+    Of the tie points that agree; NaN when they are too few to tell.
+    """
+    kept = points.kept
+    if kept.sum() < _BLOCKS**2 * _LEAST_PER_BLOCK:
+        return float("nan")
+    block = spatial_blocks(points.source_px[kept], _BLOCKS)
+    residual = points.residual_px[kept]
+    means, noise = [], []
+    for number in np.unique(block):
+        members: FloatArray = residual[block == number]
+        if len(members) >= _LEAST_PER_BLOCK:
+            means.append(np.median(members, axis=0))
+            noise.append(_MEDIAN_VARIANCE * members.var(axis=0, ddof=1) / len(members))
+    if len(means) < _BLOCKS:
+        return float("nan")
+    excess = np.mean(np.square(means), axis=0) - np.mean(noise, axis=0)
+    doubt = _LOCAL_SIGNIFICANCE * np.mean(noise, axis=0) * np.sqrt(2 / len(means))
+    return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))

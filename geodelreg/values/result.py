@@ -1,0 +1,252 @@
+"""What an alignment found out: accuracy, verdict, the correction and all that led to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from affine import Affine
+
+from geodelreg.masking import MaskUse
+from geodelreg.options import AlignOptions
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import Grid
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What must be known to correct a header, and no more.
+
+    Attributes
+    ----------
+    model : str
+        ``shift``, ``scale``, ``similarity``, ``affine`` or ``none``.
+    crs_wkt : str
+        CRS of both geotransforms (the MS raster's), WKT2.
+    original, corrected : Affine
+        Geotransform of the MS raster before and after.
+    """
+
+    model: str
+    crs_wkt: str
+    original: Affine
+    corrected: Affine
+
+    @property
+    def map_transform(self) -> Affine:
+        """Header map coordinates to true map coordinates."""
+        transform: Affine = self.corrected @ ~self.original
+        return transform
+
+    def apply(self, transform: Affine) -> Affine:
+        """Corrected geotransform of another raster that shares the header error."""
+        corrected: Affine = self.map_transform @ transform
+        return corrected
+
+
+class Outcome(Enum):
+    """What an alignment ended as."""
+
+    ALIGNED = "aligned"
+    ALREADY_ALIGNED = "already_aligned"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """One piece of evidence of the gate: a measured value against its limit."""
+
+    name: str
+    value: float
+    limit: float
+    passed: bool
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Outcome with the evidence behind it."""
+
+    outcome: Outcome
+    reasons: tuple[Reason, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """True unless refused."""
+        return self.outcome is not Outcome.REFUSED
+
+
+class CheckOutcome(Enum):
+    """What a check ended as."""
+
+    ALIGNED = "aligned"
+    MISALIGNED = "misaligned"
+    CANNOT_TELL = "cannot_tell"
+
+
+@dataclass(frozen=True, slots=True)
+class Misalignment:
+    """How far off MS lies, at the corner of the overlap where that is most; NaN = not known.
+
+    Attributes
+    ----------
+    distance_px, distance_m : float
+        In PAN pixels, and in metres on the ground.
+    sigma_px : float
+        Standard error of the distance, that of the worst corner.
+    local_px : float
+        RMS of smooth distortion that no affine transformation takes away, PAN pixels.
+    """
+
+    distance_px: float = float("nan")
+    distance_m: float = float("nan")
+    sigma_px: float = float("nan")
+    local_px: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """How good the fit is.  ``_px`` are PAN pixels, ``_m`` metres on the ground; NaN = not known.
+
+    Attributes
+    ----------
+    fit_rmse_px : float
+        Weighted-fit residuals at kept points.
+    check_rmse_px, check_ce90_px, check_rmse_m, check_ce90_m : float
+        At check points, by k-fold: every kept point predicted by a fit that has not seen it.
+    before_rmse_px, before_rmse_m : float
+        Of the kept tie points under the original header.
+    sigma_centre_px, sigma_corner_px : float
+        Standard error of the correction (radial) at the MS raster's centre and worst corner.
+    coverage : float
+        Share of the overlap's area inside the hull of the kept points, 0 to 1.
+    e1_before, e1_after : float
+        The paper's grey-value RMSE after histogram matching, in DN.
+    ncc_before, ncc_after : float
+        Correlation of the areas under the original and the corrected header.
+    kept, checked : int
+        Numbers of points.
+    """
+
+    fit_rmse_px: float = float("nan")
+    check_rmse_px: float = float("nan")
+    check_ce90_px: float = float("nan")
+    check_rmse_m: float = float("nan")
+    check_ce90_m: float = float("nan")
+    before_rmse_px: float = float("nan")
+    before_rmse_m: float = float("nan")
+    sigma_centre_px: float = float("nan")
+    sigma_corner_px: float = float("nan")
+    coverage: float = float("nan")
+    e1_before: float = float("nan")
+    e1_after: float = float("nan")
+    ncc_before: float = float("nan")
+    ncc_after: float = float("nan")
+    kept: int = 0
+    checked: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """What the two images say: a map, with everything known about it.
+
+    Attributes
+    ----------
+    model : str
+        Of `map`: ``shift``, ``scale``, ``similarity``, ``affine``; ``none`` when nothing was found.
+    map : PixelMap
+        MS pixels to MS header pixels: where the header should put what a pixel shows.
+    tie_points : TiePoints
+    accuracy : Accuracy
+    verdict : Verdict
+    step_counts : dict of str to int
+        Points that survive each step, in order; the paper's "112 → 97 → 91".
+    band_weights : dict of str to float
+        Bands matched on and their weights in the synthetic PAN.
+    warnings : tuple of str
+    """
+
+    model: str
+    map: PixelMap
+    tie_points: TiePoints
+    accuracy: Accuracy
+    verdict: Verdict
+    step_counts: Mapping[str, int]
+    band_weights: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """A raster as it was read.
+
+    Attributes
+    ----------
+    paths : tuple of str
+        Its file, or one file per band.
+    grid : Grid
+    fingerprints : tuple of str
+        Of the files when they were read; "" of what is no local file.
+    """
+
+    paths: tuple[str, ...]
+    grid: Grid
+    fingerprints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """Everything `align` found out.
+
+    Attributes
+    ----------
+    source, reference : Input
+        MS and PAN.
+    solution : Solution
+    options : AlignOptions
+    crs_operation : str
+        pyproj's operation from MS to PAN coordinates, with its accuracy; "" for equal CRSs.
+    warnings : tuple of str
+        Those of the solution and of the files.
+    masks : tuple of MaskUse
+    versions, timings_s : dict
+        Of everything that can change a result; wall time of the stages.
+    """
+
+    source: Input
+    reference: Input
+    solution: Solution
+    options: AlignOptions
+    crs_operation: str = ""
+    warnings: tuple[str, ...] = ()
+    masks: tuple[MaskUse, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    timings_s: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def tie_points(self) -> TiePoints:
+        """Of the solution."""
+        return self.solution.tie_points
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """Of the solution."""
+        return self.solution.accuracy
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the solution."""
+        return self.solution.verdict
+
+    @property
+    def correction(self) -> Correction:
+        """The correction to write: of an unbelieved or needless one, the header as it is."""
+        original = self.source.grid.transform
+        moves = self.verdict.outcome is Outcome.ALIGNED
+        affine = self.solution.map.as_affine()
+        assert affine is not None
+        corrected = original @ affine if moves else original
+        model = self.solution.model if moves else "none"
+        return Correction(model, self.source.grid.crs_wkt, original, corrected)
