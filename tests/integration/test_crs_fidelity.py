@@ -25,7 +25,7 @@ import geodelreg
 from geodelreg import WriteOptions
 from geodelreg.errors import OutputUnwritableError
 from geodelreg.values.raster import Grid
-from geodelreg.values.result import Alignment, Correction
+from geodelreg.values.result import Alignment
 from tests.integration.crs_zoo import DIFFICULT, zoo
 from tests.unit.alignment_sample import alignment
 
@@ -108,7 +108,7 @@ def aligned(path: Path) -> Alignment:
         reference=grid,
         source_paths=(str(path),),
         reference_path=str(path),
-        correction=Correction("shift", wkt, HEADER, CORRECTED),
+        corrected=CORRECTED,
     )
 
 
@@ -222,6 +222,7 @@ def test_warp_onto_pan_takes_its_epoch(tmp_path: Path) -> None:
     (tmp_path / "ms").mkdir()
     pan = in_pam(tmp_path / "pan", wkt, 'coordinateEpoch="2010.5"')
     ms = in_tiff(tmp_path / "ms", wkt, 'coordinateEpoch="2021.3"')
-    made = replace(aligned(ms), reference_path=str(pan))
+    made = aligned(ms)
+    made = replace(made, reference=replace(made.reference, paths=(str(pan),)))
     geodelreg.write(made, tmp_path / "out.tif", WriteOptions(warp=True, warp_grid="pan"))
     assert Said.of(tmp_path / "out.tif").attributes["coordinateEpoch"] == "2010.5"

@@ -66,10 +66,14 @@ def bands(folder: Path) -> list[Path]:
 
 def found_for(paths: list[Path]) -> Alignment:
     """An alignment that moves all of `paths`, as `geodelreg.align` would return it."""
-    correction = replace(correction_of(paths[0]), crs_wkt=WKT)
     grid = Grid(TRANSFORM, (40, 50), WKT)
-    made = alignment(source_paths=tuple(map(str, paths)), reference_path="pan.tif")
-    return replace(made, source=grid, reference=grid, correction=correction)
+    return alignment(
+        source=grid,
+        reference=grid,
+        source_paths=tuple(map(str, paths)),
+        reference_path="pan.tif",
+        corrected=correction_of(paths[0]).corrected,
+    )
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -556,7 +560,8 @@ def test_next_command_finishes_what_a_killed_one_began(tmp_path: Path, way: tupl
 
 def test_inputs_of_an_alignment_are_no_outputs(folder: Path) -> None:
     paths = bands(folder)
-    result = replace(found_for(paths[:1]), reference_path=str(paths[1]))
+    result = found_for(paths[:1])
+    result = replace(result, reference=replace(result.reference, paths=(str(paths[1]),)))
     before = contents(folder)
     options = WriteOptions(overwrite=True)
     with pytest.raises(OutputIsInputError, match=r"B2\.tif"):

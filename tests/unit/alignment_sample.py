@@ -57,8 +57,10 @@ def alignment(**changes: Any) -> Alignment:
     """A pair 100 × 80 (MS) and 400 × 320 (PAN), 4:1, whose header was 6 m and 3 m off.
 
     `changes` are fields of the alignment or of its solution; ``corrected`` is the geotransform that
-    its map makes of the source's.
+    its map makes of the source's, ``source_paths`` and ``reference_path`` name the inputs.
     """
+    source_paths = changes.pop("source_paths", ("scene/ms.tif",))
+    reference_path = changes.pop("reference_path", "scene/pan.tif")
     source = changes.pop("source", Grid(MS_HEADER, (80, 100), UTM16))
     reference = changes.pop("reference", Grid(PAN_HEADER, (320, 400), UTM16))
     corrected = changes.pop("corrected", SHIFTED)
@@ -89,8 +91,8 @@ def alignment(**changes: Any) -> Alignment:
     of_solution = {field.name for field in fields(Solution)} & set(changes)
     solution = replace(solution, **{name: changes.pop(name) for name in of_solution})
     made = Alignment(
-        source=Input(("scene/ms.tif",), source, ("",)),
-        reference=Input(("scene/pan.tif",), reference, ("",)),
+        source=Input(source_paths, source, ("",) * len(source_paths)),
+        reference=Input((reference_path,), reference, ("",)),
         solution=solution,
         options=AlignOptions(),
         warnings=solution.warnings,

@@ -54,7 +54,6 @@ def only(points: TiePoints, *indices: int) -> TiePoints:
         points.covariance_px2[chosen],
         points.score[chosen],
         points.status[chosen],
-        points.is_check[chosen],
         points.residual_px[chosen],
     )
 
