@@ -19,7 +19,7 @@ from geodelreg.errors import (
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
-from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
 from geodelreg.pair import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.provenance import fingerprint, provenance_tags, versions
@@ -273,6 +273,8 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.warp import write_warped
 
     options = options or WriteOptions()
+    if options.georef != "gcps":
+        check_header_holds(alignment.options.model)
     tags = provenance_tags(alignment)
     notes: list[str] = []
     for path, out in _targets(alignment, Path(target)):
@@ -300,6 +302,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.atomic import tidy
     from geodelreg.product.inplace import edit_in_place
 
+    check_header_holds(alignment.options.model)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
         return []

@@ -14,6 +14,8 @@ from geodelreg.masking import parse_mask
 
 METHODS = ("delaunay", "zhang2013", "sift")
 MODELS = ("auto", "shift", "scale", "similarity", "affine")
+BEYOND_A_HEADER: tuple[str, ...] = ()
+"""Models that no geotransform can hold."""
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
@@ -138,6 +140,21 @@ class AlignOptions:
         _check_range(self, "max_rotation_deg", 0, 180)
         _check_range(self, "max_scale", 1, 1e3)
         _check_range(self, "threads", 0, 1024)
+
+
+def check_header_holds(model: str) -> None:
+    """Refuse to write a correction into a geotransform that cannot hold it.
+
+    Raises
+    ------
+    UsageError
+    """
+    if model in BEYOND_A_HEADER:
+        raise UsageError(
+            f"model = {model} is no affine: no geotransform, and so no header, can hold it",
+            "Pass it on as control points (--gcps FILE with --dry-run, or --georef gcps), or use "
+            "another model.",
+        )
 
 
 @dataclass(frozen=True, slots=True)
