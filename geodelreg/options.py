@@ -13,8 +13,8 @@ from geodelreg.errors import UsageError
 from geodelreg.masking import parse_mask
 
 METHODS = ("delaunay", "zhang2013", "sift")
-MODELS = ("auto", "shift", "scale", "similarity", "affine")
-BEYOND_A_HEADER: tuple[str, ...] = ()
+MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective")
+BEYOND_A_HEADER = ("projective",)
 """Models that no geotransform can hold."""
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
@@ -68,7 +68,8 @@ class AlignOptions:
     model: str = _knob(
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
-        "north-up ones (shift, scale) before rotated ones (similarity, affine).",
+        "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
+        "projective one: control points do.",
         MODELS,
     )
     band: int | None = _knob(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.models import PARAMETER_COUNT, Frame, design, fitted_map
+from geodelreg.fit.models import NONLINEAR, PARAMETER_COUNT, Frame, design, fitted_map
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
@@ -15,6 +15,7 @@ _MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 _STUDENT_DOF = 6.0  # tails heavier than normal; unexplained: ablate
 REJECT_D2 = 25.0  # five standard deviations: of normal errors in the plane 4e-6 lie beyond
 _MOST_ROUNDS = 20  # unexplained: ablate
+_GAUSS_NEWTON_STEPS = 4  # from the identity; each squares an error of a percent or less
 _CONVERGED = 1e-9  # of half the raster: 1e-5 px of one of 20 000
 _RANK = 1e-13  # 450 times the rounding of float64
 _SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; unexplained: ablate
@@ -104,12 +105,17 @@ def weighted_fit(
     parameters : (k,) float64
     normal : (k, k) float64
     """
-    return _solve(*_system(model, points, frame), weight, frame)
+    found, normal = _solve(*_system(model, points, frame), weight, frame)
+    for _ in range(_GAUSS_NEWTON_STEPS if model in NONLINEAR else 0):
+        found, normal = _solve(*_system(model, points, frame, found), weight, frame)
+    return found, normal
 
 
-def _system(model: str, points: Observations, frame: Frame) -> tuple[FloatArray, FloatArray]:
-    """(N, 2, k) columns and (N, 2) right side of the equations."""
-    columns, base = design(model, points.source, frame)
+def _system(
+    model: str, points: Observations, frame: Frame, parameters: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """(N, 2, k) columns and (N, 2) right side of the equations, around some parameters."""
+    columns, base = design(model, points.source, frame, parameters)
     return columns, frame.normalise(points.target) - base
 
 
@@ -158,6 +164,8 @@ def robust_fit(
     for number in range(_MOST_ROUNDS):
         inverse = _inverse(points.covariance, extra)
         parameters, normal = _solve(columns, right, inverse * student[:, None, None], frame)
+        if model in NONLINEAR:
+            columns, right = _system(model, points, frame, parameters)
         residual = fitted_map(model, parameters, frame).forward(points.source) - points.target
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = _variance_left(residual, variances, axes)
