@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from importlib import import_module
+from threading import Thread
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +78,7 @@ def align_pair(
         When a band has no texture where it matters.
     """
     report = progress or (lambda fraction, step: None)
+    Thread(target=_load_scipy).start()
     pair = make_pair(source, reference, options, timings)
     refused: list[Solution] = []
     heard: list[Claim] = []
@@ -176,6 +179,12 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, estimate.model, fitted.points, refined.without_bright),
     )
+
+
+def _load_scipy() -> None:
+    """Load what the fit will need, half hidden behind the reading of the rasters."""
+    for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.linalg"):
+        import_module(name)
 
 
 def is_degenerate(guess: Guess) -> bool:

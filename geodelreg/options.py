@@ -13,7 +13,9 @@ from geodelreg.errors import UsageError
 from geodelreg.masking import parse_mask
 
 METHODS = ("delaunay", "zhang2013", "sift")
-MODELS = ("auto", "shift", "scale", "similarity", "affine")
+MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective")
+BEYOND_A_HEADER = ("projective",)
+"""Models that no geotransform can hold."""
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
@@ -66,7 +68,8 @@ class AlignOptions:
     model: str = _knob(
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
-        "north-up ones (shift, scale) before rotated ones (similarity, affine).",
+        "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
+        "projective one: control points do.",
         MODELS,
     )
     band: int | None = _knob(
@@ -139,6 +142,21 @@ class AlignOptions:
         _check_range(self, "max_rotation_deg", 0, 180)
         _check_range(self, "max_scale", 1, 1e3)
         _check_range(self, "threads", 0, 1024)
+
+
+def check_header_holds(model: str) -> None:
+    """Refuse to write a correction into a geotransform that cannot hold it.
+
+    Raises
+    ------
+    UsageError
+    """
+    if model in BEYOND_A_HEADER:
+        raise UsageError(
+            f"model = {model} is no affine: no geotransform, and so no header, can hold it",
+            "Pass it on as control points (--gcps FILE with --dry-run, or --georef gcps), or use "
+            "another model.",
+        )
 
 
 @dataclass(frozen=True, slots=True)

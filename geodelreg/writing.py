@@ -14,7 +14,7 @@ from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.image.input_files import input_files
 from geodelreg.image.reader import open_raster
 from geodelreg.masking import parse_mask
-from geodelreg.options import WriteOptions
+from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Alignment, Correction, Outcome
@@ -54,6 +54,8 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.warp import write_warped
 
     options = options or WriteOptions()
+    if options.georef != "gcps":
+        check_header_holds(alignment.options.model)
     tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
     notes: list[str] = []
     with (
@@ -90,6 +92,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.atomic import tidy, together
     from geodelreg.product.inplace import edit_in_place
 
+    check_header_holds(alignment.options.model)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
         return []

@@ -13,7 +13,7 @@ from affine import Affine
 from hypothesis import settings
 from numpy.typing import NDArray
 
-settings.register_profile("no deadline")  # a busy machine is no defect
+settings.register_profile("no deadline", deadline=None)  # a busy machine is no defect
 settings.load_profile("no deadline")
 
 UTM16 = "EPSG:32616"

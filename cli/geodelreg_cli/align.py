@@ -12,7 +12,7 @@ import click
 
 from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.masking import parse_mask
-from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
     GCP_FORMAT,
@@ -177,6 +177,8 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
             "--in-place corrects the header and nothing else: drop --of, --co, --georef, "
             "--strip-rpc and --warp, or write to -o OUT."
         )
+    if not given["dry_run"] and (given["in_place"] or write_options.georef != "gcps"):
+        check_header_holds(given["model"])
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
     return Request(

@@ -53,6 +53,14 @@ _NO_GEOMETRY = {".gif", ".htm", ".html", ".jpeg", ".jpg", ".md", ".png", ".txt",
 EXTENSIONS = frozenset(_BEGINNINGS)
 """Of the files that OGR may open."""
 
+GEOJSON, GEOJSON_LINES = {".geojson", ".json"}, {".geojsonl", ".geojsons"}
+"""Of the files that need no OGR."""
+
+
+def is_vector(name: str) -> bool:
+    """Whether a file's name is that of a vector file."""
+    return PurePath(name).suffix.lower() in GEOJSON | GEOJSON_LINES | EXTENSIONS
+
 
 def check_vector(name: str, allow: str) -> None:
     """Make sure that OGR can take a file only for what its extension says.

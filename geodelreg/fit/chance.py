@@ -51,8 +51,7 @@ def log_nfa(
     probability = np.minimum(np.pi * residual[inliers - 1] ** 2 / area_px2, 1.0)
     log_counts = (
         math.log10(count - sample_size)
-        + _log10_choose(count, inliers)
-        + _log10_choose(inliers, sample_size)
+        + (_log_choose(count, inliers) + _log_choose(inliers, sample_size)) / _LN_10
         + (inliers - sample_size) * np.log10(probability)
     )
     best = int(log_counts.argmin())
@@ -63,18 +62,17 @@ def log10_binomial_tail(successes: int, trials: int, probability: float) -> floa
     """log10 of P(X ≥ successes) for a binomial X, far below the smallest float too."""
     if successes <= trials * probability:
         return 0.0
+    from scipy.special import logsumexp
+
     k = np.arange(successes, trials + 1)
-    odds = math.log10(probability) - math.log10(1.0 - probability)
-    terms = _log10_choose(trials, k) + k * odds + trials * math.log10(1.0 - probability)
-    most = float(terms.max())
-    rest = float(np.exp(_LN_10 * (terms - most)).sum())
-    return min(most + math.log10(rest), 0.0)
+    odds = math.log(probability) - math.log1p(-probability)
+    terms = _log_choose(trials, k) + k * odds + trials * math.log1p(-probability)
+    return min(float(logsumexp(terms)) / _LN_10, 0.0)
 
 
-def _log10_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
-    """log10 of the numbers of ways to choose k of n.
+def _log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
+    """Natural logarithm of the numbers of ways to choose k of n."""
+    from scipy.special import gammaln
 
-    A sum of logarithms, where scipy.special's gammaln would take 0.2 s to load.
-    """
-    factorial = np.concatenate([[0.0], np.cumsum(np.log10(np.arange(1, np.max(n) + 1)))])
-    return np.asarray(factorial[n] - factorial[k] - factorial[np.subtract(n, k)])
+    ways = gammaln(np.add(n, 1)) - gammaln(np.add(k, 1)) - gammaln(np.subtract(n, k) + 1)
+    return np.asarray(ways)

@@ -46,7 +46,7 @@ class Consensus(NamedTuple):
 def consensus_affine(
     source_xy: FloatArray,
     reference_xy: FloatArray,
-    ratio: FloatArray,
+    doubt: FloatArray,
     threshold_px: float,
     seed: int = 0,
     kind: str = "affine",
@@ -63,8 +63,8 @@ def consensus_affine(
     ----------
     source_xy, reference_xy : (M, 2) float64
         One-to-one matches, outer-corner pixels.
-    ratio : (M,) float64
-        Descriptor distance ratio; smaller is better.
+    doubt : (M,) float64
+        Of each match; smaller is better, as of a descriptor distance ratio or a variance.
     threshold_px : float
         Largest residual of an inlier, in reference pixels.
     seed : int
@@ -80,7 +80,7 @@ def consensus_affine(
     count = len(source_xy)
     if count < size:
         return _nothing(count)
-    pool = np.argsort(ratio, kind="stable")[:_SCORED_MATCHES]
+    pool = np.argsort(doubt, kind="stable")[:_SCORED_MATCHES]
     source, reference = source_xy[pool], reference_xy[pool]
     rng = np.random.default_rng(seed)
     matrices: list[FloatArray] = []

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.models import PARAMETER_COUNT, Frame, design, fitted_map
+from geodelreg.fit.models import NONLINEAR, PARAMETER_COUNT, Frame, design, fitted_map
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
-_MEDIAN_CHI2_2 = 2.0 * np.log(2.0)
+_MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 _STUDENT_DOF = 6.0  # tails heavier than normal; unexplained: ablate
 REJECT_D2 = 25.0  # five standard deviations: of normal errors in the plane 4e-6 lie beyond
 _MOST_ROUNDS = 20  # unexplained: ablate
+_GAUSS_NEWTON_STEPS = 4  # from the identity; each squares an error of a percent or less
 _CONVERGED = 1e-9  # of half the raster: 1e-5 px of one of 20 000
 _RANK = 1e-13  # 450 times the rounding of float64
 _SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; unexplained: ablate
-_MOST_STEPS = 16  # a bound: it ends sooner
-_CLOSE = 1e-4  # relative to the median: far below its own error
+_CLOSE = 1e-4  # relative: far below the error of the variance itself
 _MOST_LEVERAGE = 0.95  # a residual is magnified twentyfold at most; unexplained: ablate
 
 
@@ -104,12 +105,17 @@ def weighted_fit(
     parameters : (k,) float64
     normal : (k, k) float64
     """
-    return _solve(*_system(model, points, frame), weight, frame)
+    found, normal = _solve(*_system(model, points, frame), weight, frame)
+    for _ in range(_GAUSS_NEWTON_STEPS if model in NONLINEAR else 0):
+        found, normal = _solve(*_system(model, points, frame, found), weight, frame)
+    return found, normal
 
 
-def _system(model: str, points: Observations, frame: Frame) -> tuple[FloatArray, FloatArray]:
-    """(N, 2, k) columns and (N, 2) right side of the equations."""
-    columns, base = design(model, points.source, frame)
+def _system(
+    model: str, points: Observations, frame: Frame, parameters: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """(N, 2, k) columns and (N, 2) right side of the equations, around some parameters."""
+    columns, base = design(model, points.source, frame, parameters)
     return columns, frame.normalise(points.target) - base
 
 
@@ -158,6 +164,8 @@ def robust_fit(
     for number in range(_MOST_ROUNDS):
         inverse = _inverse(points.covariance, extra)
         parameters, normal = _solve(columns, right, inverse * student[:, None, None], frame)
+        if model in NONLINEAR:
+            columns, right = _system(model, points, frame, parameters)
         residual = fitted_map(model, parameters, frame).forward(points.source) - points.target
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
             extra = _variance_left(residual, variances, axes)
@@ -235,34 +243,22 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
 
 def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
     """`common_variance` from the eigenvalues and eigenvectors of the covariances."""
+    from scipy.optimize import brentq
+
     if not residual.any():
         return 0.0
     one, other = np.einsum("nji,nj->in", axes, residual) ** 2
     first, second = np.ascontiguousarray(variances.T)
 
-    def median_at(extra: float) -> float:
-        return _median(one / (first + extra) + other / (second + extra))
+    def missing(extra: float) -> float:
+        """Nearly linear in `extra`: one less the median that χ²(2) has over that of the points."""
+        here = _median(one / (first + extra) + other / (second + extra))
+        return 1.0 - _MEDIAN_CHI2_2 / max(here, TINY)
 
-    low, high = 0.0, _median((residual**2).sum(axis=1)) + TINY
-    at_low = 1.0 - _MEDIAN_CHI2_2 / max(median_at(low), TINY)
-    if not at_low > 0.0:
+    if not missing(0.0) > 0.0:
         return 0.0
-    at_high = 1.0 - _MEDIAN_CHI2_2 / max(median_at(high), TINY)
-    # the median's inverse is nearly linear in `extra`: Illinois' false position is quick;
-    # scipy.optimize, for its brentq, would take 0.3 s to load
-    kept = 0
-    for _ in range(_MOST_STEPS):
-        middle = high - at_high * (high - low) / (at_high - at_low)
-        here = 1.0 - _MEDIAN_CHI2_2 / median_at(middle)
-        if abs(here) < _CLOSE:
-            return float(middle)
-        if here > 0.0:
-            low, at_low = middle, here
-            at_high, kept = (at_high / 2 if kept > 0 else at_high), 1
-        else:
-            high, at_high = middle, here
-            at_low, kept = (at_low / 2 if kept < 0 else at_low), -1
-    return float(high)
+    most = _median((residual**2).sum(axis=1)) + TINY
+    return float(brentq(missing, 0.0, most, rtol=_CLOSE))
 
 
 def _median(values: FloatArray) -> float:

@@ -2,6 +2,10 @@
 
 A model M turns the geotransform G into G ∘ M.  ``shift`` and ``scale`` (shift and per-axis scale)
 keep a north-up raster north-up; ``similarity`` is one on the ground, whatever the pixel's shape.
+``projective`` is no affine: no geotransform holds it, and `auto` never takes it.
+
+A new model is a branch of `design` and of `fitted_map`, with its name in `PARAMETER_COUNT` and in
+`geodelreg.options.MODELS`.
 """
 
 from __future__ import annotations
@@ -13,13 +17,19 @@ import numpy as np
 
 from geodelreg.geo.affine import affine_from_matrix
 from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.geo.maps.projective import ProjectiveMap
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray
 
 MODEL_ORDER = ("shift", "scale", "similarity", "affine")
 NORTH_UP = ("shift", "scale")
-PARAMETER_COUNT = {"none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6}  # see `design`
+NONLINEAR = ("projective",)
+"""Their design changes with the parameters."""
+PARAMETER_COUNT = {
+    "none": 0, "shift": 2, "scale": 4, "similarity": 4, "affine": 6, "projective": 8
+}  # fmt: skip
+"""As many as `design` has columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +62,9 @@ class Frame:
         return (np.asarray(xy, dtype=np.float64) - self.centre) / self.span_px
 
 
-def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatArray]:
+def design(
+    model: str, xy: FloatArray, frame: Frame, parameters: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Linear form of a model: ``target ≈ base + D p``, in normalised coordinates.
 
     Parameters
@@ -62,6 +74,8 @@ def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatA
     xy : (N, 2) float64
         Pixels.
     frame : Frame
+    parameters : (k,) float64, optional
+        Where a model that is not linear is linearised; at the identity when not given.
 
     Returns
     -------
@@ -69,6 +83,10 @@ def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatA
     base : (N, 2) float64
     """
     u = frame.normalise(xy)
+    if model == "projective":
+        return _projective_design(
+            u, np.zeros(PARAMETER_COUNT[model]) if parameters is None else parameters
+        )
     x, y = u[:, 0], u[:, 1]
     columns = np.zeros((len(u), 2, PARAMETER_COUNT[model]))
     columns[:, 0, 0] = 1.0
@@ -82,6 +100,20 @@ def design(model: str, xy: FloatArray, frame: Frame) -> tuple[FloatArray, FloatA
         growth, turn = _similarity_generators(frame)
         columns[:, :, 2], columns[:, :, 3] = u @ growth.T, u @ turn.T
     return columns, u
+
+
+def _projective_design(u: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eight parameters: those of the affine, and the two of the horizon."""
+    affine, base = _affine_columns(u), u
+    horizon = p[affine.shape[2] :]
+    depth = (1.0 + u @ horizon)[:, None]
+    there = (base + affine @ p[: affine.shape[2]]) / depth
+    columns = np.concatenate([affine, -there[:, :, None] * u[:, None, :]], axis=2) / depth[:, None]
+    return columns, there - columns @ p
+
+
+def _affine_columns(u: FloatArray) -> FloatArray:
+    return design("affine", u, Frame((0.0, 0.0), 1.0))[0]
 
 
 def _similarity_generators(frame: Frame) -> tuple[FloatArray, FloatArray]:
@@ -103,6 +135,11 @@ def fitted_map(
     covariance : (k, k) float64, optional
         Of the parameters; without it the map counts as exact.
     """
+    sigma = None
+    if covariance is not None:
+        sigma = partial(_sigma_at, model, frame, parameters, covariance)
+    if model == "projective":
+        return ProjectiveMap(_homography(parameters, frame), sigma)
     linear = np.eye(2)
     if model == "scale":
         linear = np.diag(1.0 + parameters[2:4])
@@ -113,12 +150,26 @@ def fitted_map(
         linear = np.eye(2) + parameters[2] * growth + parameters[3] * turn
     centre = np.array(frame.centre)
     offset = centre - linear @ centre + parameters[:2] * frame.span_px
-    sigma = None if covariance is None else partial(_sigma_at, model, frame, covariance)
     return AffineMap(affine_from_matrix(np.column_stack([linear, offset])), sigma)
 
 
-def _sigma_at(model: str, frame: Frame, covariance: FloatArray, xy: FloatArray) -> FloatArray:
+def _homography(parameters: FloatArray, frame: Frame) -> FloatArray:
+    """(3, 3) of pixels, from parameters in normalised coordinates."""
+    count = PARAMETER_COUNT["affine"]
+    normal = np.eye(3)
+    normal[:2, 2] = parameters[:2]
+    normal[:2, :2] += parameters[2:count].reshape(2, 2)
+    normal[2, :2] = parameters[count:]
+    to_normal = np.diag([1.0, 1.0, frame.span_px])
+    to_normal[:2, 2] = -np.array(frame.centre)
+    found = np.linalg.inv(to_normal) @ normal @ to_normal
+    return np.asarray(found / found[2, 2])
+
+
+def _sigma_at(
+    model: str, frame: Frame, parameters: FloatArray, covariance: FloatArray, xy: FloatArray
+) -> FloatArray:
     """(N,) standard error (radial, pixels) at (N, 2) pixels."""
-    columns, _ = design(model, xy, frame)
+    columns, _ = design(model, xy, frame, parameters)
     spread = np.einsum("nik,kl,nil->n", columns, covariance, columns)
     return np.asarray(np.sqrt(np.maximum(spread, 0)) * frame.span_px)

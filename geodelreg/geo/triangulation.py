@@ -52,7 +52,7 @@ class Neighbours(NamedTuple):
 
 
 def delaunay(xy: FloatArray) -> IntArray:
-    """Delaunay triangulation, by GEOS.
+    """Delaunay triangulation, by Qhull.
 
     Of points at one place only the first takes part; points that are not finite do not.
 
@@ -67,15 +67,15 @@ def delaunay(xy: FloatArray) -> IntArray:
         beginning with its smallest index, in ascending order.  Empty when there are fewer than
         three places or all lie on one line.
     """
-    import shapely
+    from scipy.spatial import Delaunay, QhullError
 
     places, first = _distinct_places(xy)
     if len(places) < 3:
         return np.empty((0, 3), dtype=np.intp)
-    parts = shapely.get_parts(shapely.delaunay_triangles(shapely.multipoints(places)))
-    rings = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
-    corner = np.searchsorted(_as_complex(places), _as_complex(rings.reshape(-1, 2)))
-    triangles = first[corner].reshape(-1, 3)
+    try:
+        triangles = first[Delaunay(places - places.mean(axis=0)).simplices]
+    except QhullError:  # all on one line
+        return np.empty((0, 3), dtype=np.intp)
     return _in_order(triangles[twice_area(xy, triangles) != 0], xy)
 
 

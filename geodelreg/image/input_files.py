@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from geodelreg.door.names import LOCAL, is_local
+from geodelreg.door.vectors import is_vector
 from geodelreg.errors import GeodelregError
 from geodelreg.image.environment import gdal_calls
-from geodelreg.image.mask_vector import is_vector
 from geodelreg.image.opening import open_dataset
 from geodelreg.tiff import is_tiff
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.door.names import LOCAL, gdal_name, is_local, needed_access
-from geodelreg.door.vectors import EXTENSIONS, check_vector
+from geodelreg.door.vectors import EXTENSIONS, GEOJSON, GEOJSON_LINES, check_vector
 from geodelreg.errors import GeodelregError, MaskError, MissingExtraError, RasterUnreadableError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
@@ -22,19 +22,12 @@ if TYPE_CHECKING:
 
 Geometries = NDArray[np.object_]
 
-_GEOJSON = {".geojson", ".json"}
-_LINES = {".geojsonl", ".geojsons"}
 WGS84 = "OGC:CRS84"
 
 _LATTICE = 17
 _AROUND = 0.05
 _STEP_PX = 4.0
 _MARGIN_PX = 2.0
-
-
-def is_vector(path: str) -> bool:
-    """Whether a file's name is that of a vector file."""
-    return PurePath(path).suffix.lower() in _GEOJSON | _LINES | EXTENSIONS
 
 
 class VectorMask:
@@ -110,8 +103,8 @@ def _read(path: str, allow: str) -> tuple[Geometries, str]:
     if is_local(path) and not Path(path).is_file():
         raise MaskError(f"the mask {path} does not exist", "Check the path.")
     suffix = PurePath(path).suffix.lower()
-    if suffix in _GEOJSON | _LINES and is_local(path):
-        return _read_geojson(path, by_line=suffix in _LINES)
+    if suffix in GEOJSON | GEOJSON_LINES and is_local(path):
+        return _read_geojson(path, by_line=suffix in GEOJSON_LINES)
     if suffix not in EXTENSIONS and needed_access(path) == LOCAL:
         raise MaskError(f"the mask {path} is GeoJSON in an archive", "Unpack the archive first.")
     return _read_with_pyogrio(path, allow)

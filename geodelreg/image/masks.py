@@ -9,8 +9,9 @@ from pathlib import PurePath
 import numpy as np
 
 from geodelreg.door.names import LOCAL, check_name
+from geodelreg.door.vectors import is_vector
 from geodelreg.image.mask_raster import RasterMask
-from geodelreg.image.mask_vector import VectorMask, is_vector
+from geodelreg.image.mask_vector import VectorMask
 from geodelreg.masking import MaskSpec, MaskUse, Ranges, parse_mask
 from geodelreg.values.raster import BoolArray, Grid
 

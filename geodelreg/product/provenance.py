@@ -80,6 +80,7 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
     """
     correction, accuracy = alignment.correction, alignment.accuracy
     source, reference = alignment.source, alignment.reference
+    after = correction.corrected.to_gdal() if alignment.fits_a_header else ()
     tags = {
         "VERSION": __version__,
         "MS": "; ".join(Path(path).name for path in source.paths),
@@ -91,7 +92,7 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
         "MODEL": correction.model,
         "VERDICT": alignment.verdict.outcome.value,
         "GEOTRANSFORM_BEFORE": _numbers(correction.original.to_gdal()),
-        "GEOTRANSFORM_AFTER": _numbers(correction.corrected.to_gdal()),
+        "GEOTRANSFORM_AFTER": _numbers(after),
         "TIE_POINTS": str(accuracy.kept),
         "CHECK_RMSE_PX": _rounded(accuracy.check_rmse_px),
         "CHECK_RMSE_M": _rounded(accuracy.check_rmse_m),

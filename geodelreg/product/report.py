@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from geodelreg.errors import shown
-from geodelreg.product.motion import HeaderMotion, header_motion
+from geodelreg.product.motion import header_motion
 from geodelreg.product.provenance import source_date
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import Grid
-from geodelreg.values.result import Alignment, Correction, Outcome
+from geodelreg.values.result import Alignment, Outcome
 from geodelreg.version import __version__
 
 SCHEMA_VERSION = "1.2"
@@ -63,7 +63,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "tool": {"name": "geodelreg", "version": __version__},
         "created": source_date(),
         "inputs": _inputs(alignment),
-        "correction": _correction(alignment.correction, header_motion(alignment)),
+        "correction": _correction(alignment),
         "tie_points": _tie_points(alignment.tie_points, tie_points),
         "step_counts": [
             {"step": step, "points": count}
@@ -125,13 +125,20 @@ def _grid(grid: Grid) -> dict[str, Any]:
     }
 
 
-def _correction(correction: Correction, motion: HeaderMotion) -> dict[str, Any]:
+def _correction(alignment: Alignment) -> dict[str, Any]:
+    """Geotransforms; a map that is none has its own numbers instead."""
+    correction, motion = alignment.correction, header_motion(alignment)
+    found: dict[str, Any] = {
+        "corrected_geotransform": correction.corrected.to_gdal(),
+        "map_transform": correction.map_transform.to_gdal(),
+    }
+    if not alignment.fits_a_header:
+        found = dict.fromkeys(found) | {"pixel_map": alignment.solution.map.to_json()}
     return {
         "model": correction.model,
         "crs_wkt": correction.crs_wkt,
         "original_geotransform": correction.original.to_gdal(),
-        "corrected_geotransform": correction.corrected.to_gdal(),
-        "map_transform": correction.map_transform.to_gdal(),
+        **found,
         "at_centre": {
             **asdict(motion),
             "distance_px": motion.distance_px,
@@ -229,6 +236,8 @@ def masks_line(alignment: Alignment) -> str:
 def _next_line(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
+    if not alignment.fits_a_header:
+        return "Next: no geotransform holds this correction: pass control points on (--gcps)."
     original, corrected = alignment.correction.original, alignment.correction.corrected
     if corrected.b or corrected.d:
         remedy = "for them add --warp"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from affine import Affine
 
@@ -33,6 +33,9 @@ class PixelMap(Protocol):
 
     def as_affine(self) -> Affine | None:
         """The same as an affine transformation; None when it is none."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Kind and numbers, of plain types."""
 
     def then(self, other: PixelMap) -> PixelMap:
         """First this map, then the other."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
 from affine import Affine
 
 from geodelreg.masking import MaskUse
@@ -241,12 +242,26 @@ class Alignment:
         return self.solution.verdict
 
     @property
+    def fits_a_header(self) -> bool:
+        """False of a correction that no geotransform can hold."""
+        return self.solution.map.as_affine() is not None
+
+    @property
     def correction(self) -> Correction:
-        """The correction to write: of an unbelieved or needless one, the header as it is."""
-        original = self.source.grid.transform
-        moves = self.verdict.outcome is Outcome.ALIGNED
-        affine = self.solution.map.as_affine()
-        assert affine is not None
-        corrected = original @ affine if moves else original
+        """The correction to write: of an unbelieved or needless one, the header as it is.
+
+        Of one that no geotransform can hold, what comes nearest to it at the raster's centre.
+        """
+        grid, moves = self.source.grid, self.verdict.outcome is Outcome.ALIGNED
+        corrected = grid.transform @ self._affine() if moves else grid.transform
         model = self.solution.model if moves else "none"
-        return Correction(model, self.source.grid.crs_wkt, original, corrected)
+        return Correction(model, grid.crs_wkt, grid.transform, corrected)
+
+    def _affine(self) -> Affine:
+        affine = self.solution.map.as_affine()
+        if affine is not None:
+            return affine
+        height, width = self.source.grid.shape
+        centre = np.array([[width / 2, height / 2]])
+        local = self.solution.map.linearise(centre)[0].ravel().tolist()
+        return Affine(*local) @ Affine.translation(*-centre[0])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from geodelreg.fit.estimate import Observations, minimum_points, robust_fit
-from geodelreg.fit.models import MODEL_ORDER, PARAMETER_COUNT, Frame, fitted_map
+from geodelreg.fit.models import PARAMETER_COUNT, Frame, fitted_map
 from geodelreg.geo.affine import affine_matrix
 
 Array = NDArray[np.float64]
@@ -31,6 +31,9 @@ def parameters(model: str, rng: np.random.Generator, size: float) -> Array:
     return rng.uniform(-size, size, PARAMETER_COUNT[model])
 
 
+MODELS = ("shift", "scale", "similarity", "affine", "projective")
+
+
 def matrix_of(model: str, values: Array, frame: Frame) -> Array:
     affine = fitted_map(model, values, frame).as_affine()
     assert affine is not None
@@ -43,7 +46,7 @@ def spread_points(frame: Frame, count: int, rng: np.random.Generator) -> Array:
 
 
 @settings(max_examples=60)
-@given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31), st.floats(1e-6, 0.3))
+@given(frames(), st.sampled_from(MODELS), st.integers(0, 2**31), st.floats(1e-6, 0.3))
 def test_models_are_recovered_from_exact_points(
     frame: Frame, model: str, seed: int, size: float
 ) -> None:
@@ -72,7 +75,7 @@ def test_a_similarity_is_one_on_the_ground(frame: Frame, seed: int, size: float)
 
 
 @settings(max_examples=60)
-@given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31), st.floats(0, 0.3))
+@given(frames(), st.sampled_from(MODELS), st.integers(0, 2**31), st.floats(0, 0.3))
 def test_the_inverse_takes_it_back(frame: Frame, model: str, seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     there = fitted_map(model, parameters(model, rng, size), frame)
@@ -91,14 +94,15 @@ def test_north_up_models_keep_the_axes(frame: Frame, seed: int, size: float) -> 
 
 
 @settings(max_examples=40)
-@given(frames(), st.sampled_from(MODEL_ORDER), st.integers(0, 2**31))
+@given(frames(), st.sampled_from(MODELS), st.integers(0, 2**31))
 def test_too_few_points_are_refused_and_just_enough_fitted(
     frame: Frame, model: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     truth = fitted_map(model, parameters(model, rng, 0.1), frame)
-    source = np.array([[0.1, 0.2], [0.9, 0.15], [0.2, 0.8], [0.85, 0.9]]) * 2 * frame.centre
-    points = Observations(source, truth.forward(source), np.tile(np.eye(2) * 0.01, (4, 1, 1)))
+    spots = [[0.1, 0.2], [0.9, 0.15], [0.2, 0.8], [0.85, 0.9], [0.45, 0.6]]
+    source = np.array(spots) * 2 * frame.centre
+    points = Observations(source, truth.forward(source), np.tile(np.eye(2) * 0.01, (5, 1, 1)))
     enough = minimum_points(model)
     with pytest.raises(ValueError, match=f"cannot determine a {model}"):
         robust_fit(model, points.take(np.arange(enough - 1)), frame)

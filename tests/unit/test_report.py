@@ -14,8 +14,7 @@ from jsonschema import Draft202012Validator, FormatChecker
 from jsonschema.exceptions import ValidationError
 from pyproj import CRS, Geod
 
-from geodelreg.fit.models import MODEL_ORDER
-from geodelreg.options import AlignOptions
+from geodelreg.options import MODELS, AlignOptions
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import report_dict, report_json, report_schema, summary_text
 from geodelreg.values.points import Status
@@ -83,7 +82,7 @@ def test_schema_knows_every_status_option_figure_and_model() -> None:
     assert set(properties["options"]["properties"]) == {f.name for f in fields(AlignOptions)}
     assert set(properties["accuracy"]["properties"]) == {f.name for f in fields(Accuracy)}
     models = properties["correction"]["properties"]["model"]["enum"]
-    assert set(models) == {"none", *MODEL_ORDER}
+    assert set(models) == {"none", *MODELS} - {"auto"}
     outcomes = properties["verdict"]["properties"]["outcome"]["enum"]
     assert outcomes == [outcome.value for outcome in Outcome]
     for option in fields(AlignOptions):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -55,6 +56,10 @@ class AffineMap(SmoothMap):
     def as_affine(self) -> Affine:
         """The transformation."""
         return self.affine
+
+    def to_json(self) -> dict[str, Any]:
+        """Its (2, 3) matrix."""
+        return {"kind": "affine", "matrix": affine_matrix(self.affine).tolist()}
 
     def then(self, other: PixelMap) -> PixelMap:
         """One affine map of two; of a fitted second one with its standard errors."""

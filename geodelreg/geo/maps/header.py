@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 from affine import Affine
 
@@ -36,6 +37,14 @@ class HeaderMap(SmoothMap):
     def inverse(self, xy: FloatArray) -> FloatArray:
         """(..., 2) reference pixels to (..., 2) source pixels; NaN where undefined."""
         return _through(xy, self.reference, self.source)
+
+    def to_json(self) -> dict[str, Any]:
+        """Both geotransforms, in GDAL's order, with their CRSs."""
+        sides = {"source": self.source, "reference": self.reference}
+        return {"kind": "headers"} | {
+            side: {"geotransform": grid.transform.to_gdal(), "crs_wkt": grid.crs_wkt}
+            for side, grid in sides.items()
+        }
 
     def as_affine(self) -> Affine | None:
         """Of equal CRSs; else None."""

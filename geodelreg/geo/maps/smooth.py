@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -28,6 +29,10 @@ class SmoothMap(ABC):
     @abstractmethod
     def inverse(self, xy: FloatArray) -> FloatArray:
         """The way back."""
+
+    @abstractmethod
+    def to_json(self) -> dict[str, Any]:
+        """Kind and numbers, of plain types."""
 
     def linearise(self, xy: FloatArray) -> FloatArray:
         """(N, 2, 3) local affines by central differences."""
@@ -79,6 +84,10 @@ class Composed(SmoothMap):
         grown = self.first.sigma_at(xy) * _magnification(self.second, between)
         return np.asarray(np.hypot(grown, self.second.sigma_at(between)))
 
+    def to_json(self) -> dict[str, Any]:
+        """Both, in order."""
+        return {"kind": "composed", "maps": [self.first.to_json(), self.second.to_json()]}
+
     def as_affine(self) -> Affine | None:
         """The product, where both are affine."""
         one, other = self.first.as_affine(), self.second.as_affine()
@@ -103,6 +112,10 @@ class Inverse(SmoothMap):
         """(N,) standard errors of the other, in pixels on its side."""
         there = self.of.inverse(xy)
         return self.of.sigma_at(there) / _magnification(self.of, there)
+
+    def to_json(self) -> dict[str, Any]:
+        """The other map."""
+        return {"kind": "inverse", "of": self.of.to_json()}
 
     def as_affine(self) -> Affine | None:
         """The inverse, where the other is affine."""

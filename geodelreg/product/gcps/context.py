@@ -74,7 +74,7 @@ def gcp_context(alignment: Alignment) -> GcpContext:
     points = alignment.tie_points
     return GcpContext(
         source=alignment.source.grid,
-        corrected=alignment.correction.corrected,
+        corrected=alignment.correction.corrected if alignment.fits_a_header else None,
         reference=alignment.reference.grid,
         source_paths=alignment.source.paths,
         reference_path=alignment.reference.paths[0],
