@@ -8,8 +8,8 @@ import sys
 import pytest
 
 HEAVY = {
-    "affine", "cv2", "dask", "jinja2", "matplotlib", "numpy", "pyproj", "rasterio", "rich", "scipy",
-    "shapely",
+    "affine", "cv2", "dask", "distributed", "jinja2", "matplotlib", "numpy", "pyproj", "rasterio",
+    "rich", "scipy", "shapely",
 }  # fmt: skip
 
 
@@ -28,6 +28,7 @@ def modules_after(statement: str) -> set[str]:
         ["--version"],
         ["--help"],
         ["align", "--help"],
+        ["batch", "--help"],
         ["check", "--help"],
         ["gcps", "--help"],
         ["revert", "-h"],
