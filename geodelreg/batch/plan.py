@@ -139,8 +139,8 @@ class _Targets:
         if not in_place and not path.startswith(self._root.rstrip("/") + "/"):
             raise UsageError(f"out {target} lies outside of {self._root}", "Use --out-root.")
         if path in self._places:
-            what = "is corrected in place" if in_place else "is the output"
-            raise UsageError(f"{target} {what} of {self._places[path]} already")
+            what = "is corrected in place by" if in_place else "is the output of"
+            raise UsageError(f"{target} {what} {self._places[path]} already")
         self._places[path] = place
         if in_place:
             return
