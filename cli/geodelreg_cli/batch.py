@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -175,6 +176,8 @@ def batch(manifest: Path | None, **given: Any) -> int:
         for problem in error.problems:
             click.echo("".join(c if c.isprintable() else "\ufffd" for c in problem), err=True)
         raise
+    if given["dask"] and not (given["verbose"] or given["debug"]):
+        _silence_dask()
     with _shown(ready, given) as show:
         for result in ready:
             show(result)
@@ -238,6 +241,14 @@ def _shown(ready: Batch, given: dict[str, Any]) -> Iterator[Any]:
 
     with live_table(ready) as show:
         yield show
+
+
+def _silence_dask() -> None:
+    """Dask logs tracebacks of what the command says in a sentence."""
+    with suppress(ImportError):
+        import distributed  # noqa: F401 - it sets its levels when it is loaded
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def _silent(result: PairResult) -> None:

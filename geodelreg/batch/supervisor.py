@@ -77,13 +77,13 @@ class Child:
         self._answers: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()
         try:
-            self._answer(START_S, None)
+            self._answer("it", START_S, None)
         except GeodelregError:
             self.end()
             raise
         except _DiedError:
             raise PairCrashedError(
-                f"the process for pairs does not start: {self._last_words()}",
+                f"the process for pairs does not start, it ended with {self._ending()}",
                 "Run `python -m geodelreg.batch.child` there and see what it prints.",
             ) from None
 
@@ -103,15 +103,15 @@ class Child:
         self.pairs += 1
         self._errors.seek(0)
         self._errors.truncate()
-        kills = _kills_for_memory()
+        name, kills = Path(task.pair.sources[0]).name, _kills_for_memory()
         assert self._process.stdin is not None
         try:
             with suppress(BrokenPipeError):
                 self._process.stdin.write(task.to_json() + "\n")
                 self._process.stdin.flush()
-            answer = json.loads(self._answer(task.timeout_s, task.memory_mb))
+            answer = json.loads(self._answer(name, task.timeout_s, task.memory_mb))
         except _DiedError:
-            raise self._cause_of_death(kills) from None
+            raise self._cause_of_death(name, kills) from None
         self.is_healthy = bool(answer["healthy"])
         result = PairResult.from_json(answer["result"])
         if result.error == PairMemoryError.__name__ and self.pairs > 1:
@@ -138,7 +138,7 @@ class Child:
                 self._answers.put(line)
         self._answers.put("")
 
-    def _answer(self, timeout_s: float | None, memory_mb: int | None) -> str:
+    def _answer(self, name: str, timeout_s: float | None, memory_mb: int | None) -> str:
         """The next line, while the child keeps to its limits."""
         start = monotonic()
         while True:
@@ -151,35 +151,36 @@ class Child:
             if timeout_s is not None and monotonic() - start > timeout_s:
                 self.end()
                 raise PairTimeoutError(
-                    f"it took more than {timeout_s:g} s",
+                    f"{name} took more than {timeout_s:g} s",
                     "Allow more with --timeout, then --retry failed.",
                 )
             if memory_mb is not None and _peak_mb(self._process.pid) > memory_mb:
                 self.end()
                 raise PairMemoryError(
-                    f"it needed more than {memory_mb} MB of memory",
+                    f"{name} needed more than {memory_mb} MB of memory",
                     "Allow more with --memory, then --retry failed.",
                 )
 
-    def _cause_of_death(self, kills_before: int) -> GeodelregError:
+    def _cause_of_death(self, name: str, kills_before: int) -> GeodelregError:
         code = self._process.returncode
         if code == -signal.SIGKILL and _kills_for_memory() > kills_before:
             return PairMemoryError(
-                "the system killed its process, for memory was short",
+                f"the system killed the process of {name}, for memory was short",
                 "Run fewer pairs at a time (-j), or on a machine with more memory.",
             )
-        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         return PairCrashedError(
-            f"its process ended with {how} ({self._last_words()})",
+            f"the process of {name} ended with {self._ending()}",
             "Look at the rasters with gdalinfo; obtain them again.",
         )
 
-    def _last_words(self) -> str:
-        """The error that a crash leaves on stderr: its first line, or the last of a traceback."""
+    def _ending(self) -> str:
+        """How it ended, and what it left on stderr: a crash's first line, a traceback's last."""
+        code = self._process.returncode
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         fatal = [line for line in lines if line.startswith("Fatal Python error")]
-        return (fatal or lines[-1:] or ["it left no message"])[0]
+        return f"{how} ({(fatal or lines[-1:] or ['no message'])[0]})"
 
 
 def _peak_mb(pid: int) -> float:
