@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from affine import Affine
 from rasterio.windows import Window
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_tiles"
@@ -51,7 +52,7 @@ def write_pairs(folder: Path, count: int, seed: int = 0) -> Path:
 def _crop(raster: rasterio.DatasetReader, path: Path, start: tuple[int, int], side: int) -> None:
     window = Window(*start, side, side)
     profile = {**raster.profile, "width": side, "height": side, "tiled": False,
-               "transform": raster.window_transform(window)}  # fmt: skip
+               "transform": raster.transform @ Affine.translation(*start)}  # fmt: skip
     profile = {k: v for k, v in profile.items() if not k.startswith("block")}
     with rasterio.open(path, "w", **profile) as out:
         out.write(raster.read(window=window))

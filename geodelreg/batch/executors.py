@@ -5,12 +5,15 @@ All are one thing to the driver: text goes in, a future of text comes out.
 
 from __future__ import annotations
 
+import logging
 import os
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from typing import Any, Protocol
 
 from geodelreg.batch.supervisor import Children, run_pair
 from geodelreg.errors import ClusterError, MissingExtraError
+
+logger = logging.getLogger(__name__)
 
 _PER_THREAD = 4
 _RESUME = "Once it runs, go on with --resume: what is finished is not repeated."
@@ -85,6 +88,7 @@ class DaskWorkers:
         self._executor = client.get_executor(pure=False, retries=0)
         self._count = count
         self._owned = owned
+        self._alone = False
 
     @property
     def at_once(self) -> int:
@@ -108,6 +112,9 @@ class DaskWorkers:
             raise ClusterError(
                 f"the connection to Dask's scheduler is {self._client.status}", _RESUME
             )
+        if not (self._client.nthreads() or self._alone):
+            self._alone = True
+            logger.warning("the cluster has no workers now; the pairs wait for some")
 
     def close(self) -> None:
         """Take back what has not begun."""
