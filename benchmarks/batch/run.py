@@ -19,9 +19,9 @@ from benchmarks.report import machine, replace_section
 
 LEAST_SPEEDUP, MOST_OVERHEAD = 1.8, 0.05
 MOST_MB, MOST_PLAN_S, MOST_LEDGER_MS = 500.0, 60.0, 1.0
-HEAD = """`python -m benchmarks batch --folder DIR` ({}). A small pair is PAN 440² and MS 110² × 4,
-cut from the sample. In the huge manifest the pairs only wait, as long as recorded ones took, scaled;
-plan, ledger, driver and Dask's scheduler are real.
+HEAD = """`python -m benchmarks batch --folder DIR` ({}). A small pair is
+PAN 440² and MS 110² × 4, cut from the sample. In the huge manifest the pairs only wait, as long as
+recorded ones took, scaled; plan, ledger, driver and Dask's scheduler are real.
 
 | promise | measured | kept |
 |---|---|---|"""
@@ -185,23 +185,15 @@ def _of_kills(kills: dict[str, Any]) -> list[Promise]:
 def _of_large(large: dict[str, Any]) -> list[Promise]:
     label = f"{large['pairs']:,} pairs".replace(",", " ")
     size = 1e6 * large["ledger_mb"] / large["pairs"]
-    ledger = f"{large['ledger_ms_per_pair']:.2f} ms, {size:.0f} bytes on the disk"
-    rate = large["pairs"] / large["run_s"]
-    through = f"{rate:.0f} pairs/s, {large['run_cpu_ms_per_pair']:.2f} ms of the driver's CPU"
-    plan_s, peak_mb = large["plan_s"], large["peak_mb"]
+    plan_s, peak_mb, ledger_ms = (large[n] for n in ("plan_s", "peak_mb", "ledger_ms_per_pair"))
+    rate, cpu_ms = large["pairs"] / large["run_s"], large["run_cpu_ms_per_pair"]
+    ledger = f"{ledger_ms:.2f} ms, {size:.0f} bytes on the disk"
+    through = f"{rate:.0f} pairs/s, {cpu_ms:.2f} ms of the driver's CPU"
     return [
         (f"{label}: driver ≤ 500 MB", f"{peak_mb:.0f} MB", peak_mb <= MOST_MB),
-        (
-            f"{label}: planned in seconds",
-            f"{large['plan_s']:.1f} s",
-            large["plan_s"] <= MOST_PLAN_S,
-        ),
-        (f"{label}: ledger ≤ 1 ms a pair", ledger, large["ledger_ms_per_pair"] <= MOST_LEDGER_MS),
-        (
-            f"{label}: through driver and scheduler",
-            f"{rate:.0f} pairs/s, {cpu:.2f} ms of CPU",
-            True,
-        ),
+        (f"{label}: planned in seconds", f"{plan_s:.1f} s", plan_s <= MOST_PLAN_S),
+        (f"{label}: ledger ≤ 1 ms a pair", ledger, ledger_ms <= MOST_LEDGER_MS),
+        (f"{label}: through driver and scheduler", through, True),
     ]
 
 
