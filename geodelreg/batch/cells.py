@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import Field, asdict, fields
+from dataclasses import Field, fields, replace
+from functools import lru_cache
 from typing import Any
 
 from geodelreg.errors import UsageError
@@ -60,15 +61,19 @@ def options_of(
         A value is impossible.
     """
     given = {name: cell for name, cell in cells.items() if name not in FILES and not _empty(cell)}
-    kinds = ((AlignOptions, _ALIGN, align), (WriteOptions, _WRITE, write))
-    found = []
-    for kind, known, base in kinds:
-        own = {name: _value(known[name], given[name]) for name in given if name in known}
-        values = asdict(base) | own
-        checked = asdict(kind(**values))
-        default = asdict(kind())
-        found.append({name: v for name, v in checked.items() if v != default[name]})
-    return found[0], found[1]
+    own = [
+        tuple((name, _value(known[name], given[name])) for name in given if name in known)
+        for known in (_ALIGN, _WRITE)
+    ]
+    return _changed(align, own[0]), _changed(write, own[1])
+
+
+@lru_cache(maxsize=1024)
+def _changed(base: AlignOptions | WriteOptions, own: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """What differs from the defaults in `base` with other values; most pairs have the same."""
+    checked, default = replace(base, **dict(own)), type(base)()
+    values = {f.name: getattr(checked, f.name) for f in fields(checked)}
+    return {name: value for name, value in values.items() if value != getattr(default, name)}
 
 
 def list_of(name: str, cell: Any) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from geodelreg.geo.crs import map_points
 from geodelreg.product.motion import header_motion
 from geodelreg.types import Alignment, FloatArray, Grid, Misalignment
 
-_PER_EDGE = 8
+_PER_EDGE = 4
 _DIGITS = 7
 """Of degrees: 1 cm."""
 

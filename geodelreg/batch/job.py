@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ MODES = (ALIGN, IN_PLACE, CHECK)
 ALIGNED, ALREADY_ALIGNED, REFUSED, FAILED = "aligned", "already_aligned", "refused", "failed"
 MISALIGNED, CANNOT_TELL = "misaligned", "cannot_tell"
 OUTCOMES = (ALIGNED, ALREADY_ALIGNED, MISALIGNED, REFUSED, CANNOT_TELL, FAILED)
+
+_COMPACT = (",", ":")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,8 @@ class Pair:
 
     def to_json(self) -> str:
         """The same text for equal pairs."""
-        return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return json.dumps(values, sort_keys=True, separators=_COMPACT, ensure_ascii=False)
 
     @classmethod
     def from_json(cls, text: str) -> Pair:
@@ -92,7 +95,7 @@ class Task:
 
     def to_json(self) -> str:
         """One line of text."""
-        return json.dumps(asdict(self))
+        return json.dumps(asdict(self), separators=_COMPACT)
 
     @classmethod
     def from_json(cls, text: str) -> Task:
@@ -147,7 +150,8 @@ class PairResult:
 
     def to_json(self) -> str:
         """One line of text."""
-        return json.dumps(asdict(self), ensure_ascii=False, allow_nan=False)
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return json.dumps(values, separators=_COMPACT, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> PairResult:

@@ -151,16 +151,22 @@ class _Targets:
 
     def check(self, inputs: set[str]) -> None:
         """What can be told only when all are known."""
+        folders = {""}
         reserved = {resolved(str(path)) for path in self._setting.reserved}
         for path, place in self._places.items():
             if path in inputs:
                 self.problems.append((place, f"{path} is written, and is an input of the batch"))
             if path in reserved:
                 self.problems.append((place, f"{path} is a file of the batch itself"))
-            for above in map(str, Path(path).parents):
+            above = path.rpartition("/")[0]
+            while above not in folders:
+                folders.add(above)
                 if above in self._places:
                     text = f"out {path} lies below {above}, which is the output of "
                     self.problems.append((place, text + self._places[above]))
+                    folders.discard(above)
+                    break
+                above = above.rpartition("/")[0]
 
 
 def _pair(cells: Mapping[str, Any], setting: Setting) -> Pair:
