@@ -46,6 +46,7 @@ class _View:
     def render(self) -> RenderableType:
         """The table as it is now."""
         from rich.console import Group
+        from rich.padding import Padding
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
@@ -60,7 +61,8 @@ class _View:
         ends = _clock(left / rate) if rate else "-"
         table.add_row(*map(str, counts.values()), str(left), f"{60 * rate:.1f}", ends)
         lines = [Text(text, no_wrap=True, overflow="ellipsis") for text in self._last]
-        return Group(ProgressBar(max(total, 1), total - left), table, *lines)
+        bar = Padding(ProgressBar(max(total, 1), total - left), 0)  # ends its line
+        return Group(bar, table, *lines)
 
 
 def _clock(seconds: float) -> str:

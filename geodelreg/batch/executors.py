@@ -40,7 +40,7 @@ class LocalWorkers:
     """Threads of this process, with a child each."""
 
     def __init__(self, count: int) -> None:
-        self.at_once = count or len(os.sched_getaffinity(0))
+        self.at_once = count or _cores()
         self._children = Children()
         self._threads = ThreadPoolExecutor(self.at_once, thread_name_prefix="pair")
 
@@ -56,6 +56,12 @@ class LocalWorkers:
         self._threads.shutdown(wait=False, cancel_futures=True)
         self._children.stop()
         self._threads.shutdown(wait=True)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
 class ExecutorWorkers:

@@ -136,7 +136,7 @@ class _Targets:
     def add(self, target: str, place: str) -> None:
         path = resolved(target)
         in_place = self._setting.mode == IN_PLACE
-        if not in_place and not path.startswith(self._root.rstrip("/") + "/"):
+        if not in_place and not path.startswith(self._root.rstrip(os.sep) + os.sep):
             raise UsageError(f"out {target} lies outside of {self._root}", "Use --out-root.")
         if path in self._places:
             what = "is corrected in place by" if in_place else "is the output of"
@@ -158,7 +158,7 @@ class _Targets:
                 self.problems.append((place, f"{path} is written, and is an input of the batch"))
             if path in reserved:
                 self.problems.append((place, f"{path} is a file of the batch itself"))
-            above = path.rpartition("/")[0]
+            above = path.rpartition(os.sep)[0]
             while above not in folders:
                 folders.add(above)
                 if above in self._places:
@@ -166,7 +166,7 @@ class _Targets:
                     self.problems.append((place, text + self._places[above]))
                     folders.discard(above)
                     break
-                above = above.rpartition("/")[0]
+                above = above.rpartition(os.sep)[0]
 
 
 def _pair(cells: Mapping[str, Any], setting: Setting) -> Pair:
@@ -257,7 +257,7 @@ def resolved(path: str) -> str:
     given = Path(path).absolute()
     if given.name in ("", "..") or given.is_symlink():
         return os.path.realpath(path)
-    return f"{_real_folder(str(given.parent)).rstrip('/')}/{given.name}"
+    return f"{_real_folder(str(given.parent)).rstrip(os.sep)}{os.sep}{given.name}"
 
 
 @lru_cache(maxsize=4096)

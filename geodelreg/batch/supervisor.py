@@ -163,7 +163,7 @@ class Child:
 
     def _cause_of_death(self, name: str, kills_before: int) -> GeodelregError:
         code = self._process.returncode
-        if code == -signal.SIGKILL and _kills_for_memory() > kills_before:
+        if code == -9 and _kills_for_memory() > kills_before:
             return PairMemoryError(
                 f"the system killed the process of {name}, for memory was short",
                 "Run fewer pairs at a time (-j), or on a machine with more memory.",

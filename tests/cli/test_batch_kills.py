@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
+import subprocess
 import time
 from collections import Counter
 from pathlib import Path
@@ -21,7 +23,7 @@ from tests.cli.batch_helpers import (
     start,
     wait_until,
 )
-from tests.cli.helpers import Command
+from tests.cli.helpers import COMMAND, Command
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 COUNT = 6
@@ -147,6 +149,50 @@ def test_an_interrupted_batch_leaves_no_process_and_no_debris(
     assert debris(folder) == []
     assert geodelreg("batch", "pairs.csv", "--resume", "-q", cwd=folder).returncode == 0
     check_finished(folder, expected)
+
+
+def test_a_child_has_one_thread_for_each_library(folder: Path) -> None:
+    driver = start("batch", "pairs.csv", "-j", "1", cwd=folder)
+    wait_until(lambda: finished(folder) >= 1)
+    (child,) = children_for_pairs(driver.pid)
+    given = Path(f"/proc/{child}/environ").read_text().split("\0")
+    libraries = ("OMP", "OPENBLAS", "MKL", "GDAL")
+    assert {f"{name}_NUM_THREADS=1" for name in libraries} <= set(given)
+    assert "OPENCV_FOR_THREADS_NUM=1" in given
+    most = 0
+    while driver.poll() is None:
+        try:
+            most = max(most, len(list(Path(f"/proc/{child}/task").iterdir())))
+        except OSError:
+            break
+        time.sleep(0.01)
+    assert driver.wait(120) == 0
+    assert 1 < most <= 4  # its own, that which reads tasks, and pools of one
+
+
+def test_a_terminal_shows_how_far_it_is(folder: Path) -> None:
+    master, slave = pty.openpty()
+    (folder / "pan_1.tif").unlink()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
+    driver = subprocess.Popen(
+        [*COMMAND, "batch", "pairs.csv"], cwd=folder, stderr=slave, env=environment
+    )
+    os.close(slave)
+    shown = b""
+    while True:
+        try:
+            part = os.read(master, 65536)
+        except OSError:  # the other end is closed
+            break
+        if not part:
+            break
+        shown += part
+    os.close(master)
+    assert driver.wait(120) == 1
+    text = shown.decode()
+    for words in ("pairs/min", "time left", "aligned", "failed", "pan_1.tif does not exist"):
+        assert words in text
+    assert f"{COUNT} pairs: " in text.splitlines()[-3] + text.splitlines()[-4]
 
 
 def test_a_ledger_has_one_driver_at_a_time(folder: Path, geodelreg: Command) -> None:
