@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from geodelreg.types import Alignment
 
 _T = TypeVar("_T")
+_IDLE_S = 900.0
+"""A worker that has had no pair for so long gets a new process with the next."""
 _LOCK_TRIES, _LOCK_WAIT_S = 40, 0.5
 
 
@@ -58,7 +60,11 @@ def main() -> None:
     _warm_up()
     _answer(answers, json.dumps({"ready": os.getpid()}))
     while True:
-        result, healthy = run_task(Task.from_json(tasks.get()))
+        try:
+            line = tasks.get(timeout=_IDLE_S)
+        except queue.Empty:
+            return
+        result, healthy = run_task(Task.from_json(line))
         _answer(answers, json.dumps({"result": result.to_json(), "healthy": healthy}))
 
 

@@ -82,10 +82,12 @@ class Child:
             self.end()
             raise
         except _DiedError:
-            raise PairCrashedError(
-                f"the process for pairs does not start, it ended with {self._ending()}",
-                "Run `python -m geodelreg.batch.child` there and see what it prints.",
-            ) from None
+            raise self._not_started() from None
+
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid
 
     @property
     def is_alive(self) -> bool:
@@ -161,6 +163,14 @@ class Child:
                     "Allow more with --memory, then --retry failed.",
                 )
 
+    def _not_started(self) -> GeodelregError:
+        what = f"the process for pairs does not start on {platform.node()}"
+        if self._process.returncode < 0:  # someone killed it; the next may live
+            return PairCrashedError(f"{what}: {self._ending()}", "Look who kills processes there.")
+        return ClusterError(
+            f"{what}: {self._ending()}", "Install geodelreg there; `geodelreg --version` tries it."
+        )
+
     def _cause_of_death(self, name: str, kills_before: int) -> GeodelregError:
         code = self._process.returncode
         if code == -9 and _kills_for_memory() > kills_before:
@@ -169,7 +179,7 @@ class Child:
                 "Run fewer pairs at a time (-j), or on a machine with more memory.",
             )
         return PairCrashedError(
-            f"the process of {name} ended with {self._ending()}",
+            f"the process of {name} ended: {self._ending()}",
             "Look at the rasters with gdalinfo; obtain them again.",
         )
 
@@ -232,6 +242,8 @@ class Children:
         while True:
             try:
                 result = self._try(task, fresh=attempt > 1)
+            except ClusterError:
+                raise
             except _FinalError as final:
                 failure = final.error
                 break
@@ -275,7 +287,7 @@ class Children:
             self._busy.add(child)
             stopped = self._stopped
         if stopped:
-            child.end()
+            child.kill()
         return child
 
     def _waiting(self, environment: Mapping[str, str]) -> Child | None:
@@ -331,7 +343,7 @@ def run_pair(text: str) -> str:
     Raises
     ------
     ClusterError
-        This worker has another geodelreg than the driver.
+        This worker has another geodelreg than the driver, or none that starts.
     """
     return _shared.run(text)
 

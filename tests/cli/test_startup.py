@@ -43,3 +43,8 @@ def test_help_and_version_load_nothing_heavy(args: list[str]) -> None:
 def test_importing_the_library_or_the_rio_plugin_loads_nothing_heavy() -> None:
     assert not modules_after("import geodelreg, geodelreg.errors, geodelreg.options") & HEAVY
     assert not modules_after("import geodelreg_cli.rio") & HEAVY
+
+
+def test_a_driver_of_many_pairs_and_its_workers_load_nothing_heavy() -> None:
+    statement = "from geodelreg.batch import run; import geodelreg.batch.child"
+    assert not modules_after(statement) & HEAVY

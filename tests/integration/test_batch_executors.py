@@ -126,6 +126,16 @@ def test_rows_and_options_in_python(folder: Path) -> None:
     assert not (folder / "bad.ledger").exists()
 
 
+def test_workers_that_cannot_start_a_process_end_the_batch_and_fail_no_pair(folder: Path) -> None:
+    broken = {"PYTHONHOME": str(folder)}
+    results = geodelreg.batch.run(folder / "pairs.csv", config=broken)
+    with pytest.raises(ClusterError, match="does not start"):
+        list(results)
+    ledger = folder / "pairs.ledger"
+    assert query(ledger, "SELECT count(*) FROM outcomes") == [(0,)]
+    assert debris(folder) == []
+
+
 @contextmanager
 def local_cluster(folder: Path) -> Iterator[LocalCluster]:
     with LocalCluster(

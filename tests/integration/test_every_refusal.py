@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -107,10 +109,18 @@ def without_workers(folder: Path) -> object:
     return listed(folder, ROW, executor=executor)
 
 
-def in_child(folder: Path, timeout_s: float | None = None, memory_mb: int | None = None) -> object:
+def in_child(
+    folder: Path,
+    timeout_s: float | None = None,
+    memory_mb: int | None = None,
+    killed: bool = False,
+) -> object:
     pair = Pair((str(raster(folder, "ms.tif")),), str(raster(folder, "pan.tif")))
     task = Task(1, pair, "check", 0.5, timeout_s, memory_mb, {}, __version__)
-    return Child({}).run(task)
+    child = Child({})
+    if killed:
+        os.kill(child.pid, signal.SIGKILL)
+    return child.run(task)
 
 
 @dataclass(frozen=True)
@@ -170,7 +180,7 @@ CASES = {
         lambda folder: in_child(folder, timeout_s=0.01), ("ms.tif", "0.01 s")
     ),
     errors.PairMemoryError: Case(lambda folder: in_child(folder, memory_mb=9), ("ms.tif", "9 MB")),
-    errors.PairCrashedError: Case(lambda _: Child({"PYTHONHOME": "nowhere"}), ("process",)),
+    errors.PairCrashedError: Case(lambda folder: in_child(folder, killed=True), ("ms.tif",)),
     errors.AlignmentRefusedError: Case(aligned, ("ms.tif", "pan.tif")),
 }
 
