@@ -13,6 +13,7 @@ import click
 
 from geodelreg.errors import ManifestError
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
+from geodelreg_cli.console import printable
 from geodelreg_cli.options import (
     SectionCommand,
     SectionOption,
@@ -174,7 +175,7 @@ def batch(manifest: Path | None, **given: Any) -> int:
         ready.prepare()
     except ManifestError as error:
         for problem in error.problems:
-            click.echo("".join(c if c.isprintable() else "\ufffd" for c in problem), err=True)
+            click.echo(printable(problem), err=True)
         raise
     if given["dask"] and not (given["verbose"] or given["debug"]):
         _silence_dask()
@@ -260,7 +261,7 @@ def _line(result: PairResult) -> str:
     parts = [f"{result.number} {Path(result.sources[0]).name}: {result.outcome}"]
     parts += [result.error] if result.error else []
     parts += [result.reason] if result.reason else []
-    return ", ".join(parts)
+    return printable(", ".join(parts))
 
 
 def _summarise(ready: Batch) -> None:

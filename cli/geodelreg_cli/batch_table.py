@@ -9,6 +9,8 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
+from geodelreg_cli.console import printable
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -40,8 +42,8 @@ class _View:
     def take(self, result: PairResult) -> None:
         """Take one result in."""
         self._done += 1
-        name = Path(result.sources[0]).name
-        self._last.extend(f"{name}: {text}" for text in (*result.warnings, result.reason) if text)
+        name, texts = Path(result.sources[0]).name, (*result.warnings, result.reason)
+        self._last.extend(printable(f"{name}: {text}") for text in texts if text)
 
     def render(self) -> RenderableType:
         """The table as it is now."""

@@ -21,6 +21,11 @@ class _Stderr(logging.Handler):
         click.echo(self.format(record), err=True)
 
 
+def printable(text: str) -> str:
+    """`text` without what would control the terminal; names of files may hold anything."""
+    return "".join(char if char.isprintable() else "\ufffd" for char in text)
+
+
 def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     """Send logs to stderr: warnings always but with -q, progress of the steps with -v.
 

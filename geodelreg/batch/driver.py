@@ -89,7 +89,9 @@ class Batch:
         tables: Iterable[AnyPath] = (),
         config: Mapping[str, str] | None = None,
     ) -> None:
-        self._manifest, self._executor = manifest, executor
+        # rows are gone through more than once
+        self._manifest = manifest if isinstance(manifest, str | PathLike) else list(manifest)
+        self._executor = executor
         self._options = options or BatchOptions()
         align = with_absolute_masks(align or AlignOptions())
         self._retry = _known_outcomes(retry)

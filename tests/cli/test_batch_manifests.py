@@ -190,6 +190,11 @@ def test_nul_bytes_and_open_quotes_in_csv(folder: Path, geodelreg: Command) -> N
 def test_texts_of_a_manifest_do_not_control_the_terminal(folder: Path, geodelreg: Command) -> None:
     manifest = write_lines(folder / "pairs.jsonl", [{**ROW, "\x1b[2Jmodel": 1}])
     assert "\x1b" not in refused(geodelreg, manifest).stderr
+    write_lines(manifest, [{**ROW, "ms": "\x1b[2J.tif"}])
+    done = geodelreg("batch", manifest, "-v")
+    assert done.returncode == 1
+    assert "[2J.tif" in done.stderr
+    assert "\x1b" not in done.stderr
 
 
 def test_formulas_are_no_formulas_in_the_table(folder: Path, geodelreg: Command) -> None:
