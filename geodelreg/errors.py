@@ -126,6 +126,42 @@ class MissingExtraError(GeodelregError):
     """An optional dependency is not installed."""
 
 
+class ManifestError(GeodelregError):
+    """Pairs of a batch cannot be run as they are listed; none was started.
+
+    Attributes
+    ----------
+    problems : tuple of str
+        What is wrong, each with its line; not more than the first hundred.
+    """
+
+    exit_code = 2
+
+    def __init__(self, cause: str, remedy: str = "", problems: tuple[str, ...] = ()) -> None:
+        super().__init__(cause, remedy)
+        self.problems = problems
+
+
+class LedgerError(GeodelregError):
+    """The ledger of a batch exists, is of another version, or belongs to other pairs."""
+
+
+class ClusterError(GeodelregError):
+    """The workers of a batch cannot be reached, are lost, or are of another version."""
+
+
+class PairTimeoutError(GeodelregError):
+    """A pair of a batch took longer than it may."""
+
+
+class PairMemoryError(GeodelregError):
+    """A pair of a batch needed more memory than it may have, or than there is."""
+
+
+class PairCrashedError(GeodelregError):
+    """A pair of a batch ended its process, each time that it was tried."""
+
+
 class AlignmentRefusedError(GeodelregError):
     """The evidence does not support any alignment; nothing was written.
 

@@ -202,3 +202,42 @@ class WriteOptions:
                 raise UsageError(f"creation option {option!r} is not KEY=VALUE")
         if self.warp and self.georef == "gcps":
             raise UsageError("--warp and --georef gcps exclude each other", "Drop one of them.")
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOptions:
+    """How many pairs are run."""
+
+    check: bool = _knob(False, "Verdicts only, as geodelreg check gives them; nothing is written.")
+    limit_px: float = _knob(
+        0.5,
+        "Largest misalignment, anywhere in the overlap, that --check counts as aligned, in PAN "
+        "pixels.",
+    )
+    in_place: bool = _knob(
+        False, "Correct the headers of the MS files themselves; the pairs then have no OUT."
+    )
+    workers: int = _knob(
+        0,
+        "Pairs at a time on this machine, each in a process of one thread; 0 = as many as cores. "
+        "With --dask: pairs under way, 0 = four for each thread of the cluster.",
+    )
+    timeout_s: float | None = _knob(
+        None, "Seconds that a pair may take; one that takes longer has failed."
+    )
+    memory_mb: int | None = _knob(
+        None,
+        "Megabytes that the process of a pair may hold; a pair that needs more has failed. Needs "
+        "Linux where the pairs run.",
+    )
+    fail_fast: bool = _knob(
+        False, "Start no pair after one has failed; --resume goes on with the rest."
+    )
+
+    def __post_init__(self) -> None:
+        _check_range(self, "limit_px", 0, 1e6)
+        _check_range(self, "workers", 0, 100_000)
+        _check_range(self, "timeout_s", 1e-3, 1e9)
+        _check_range(self, "memory_mb", 1, 1e9)
+        if self.check and self.in_place:
+            raise UsageError("--check and --in-place exclude each other", "Drop one of them.")

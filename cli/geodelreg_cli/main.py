@@ -24,6 +24,7 @@ from geodelreg_cli.interrupts import Terminated, termination_as_exception
 # name: (module that holds the click command of that name, line in the list of commands)
 COMMANDS = {
     "align": ("geodelreg_cli.align", "Correct the georeferencing of MS so that it fits PAN."),
+    "batch": ("geodelreg_cli.batch", "Align or check many pairs, with a ledger; also on Dask."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
@@ -36,6 +37,7 @@ Examples:
   geodelreg align ms.tif pan.tif --in-place
   geodelreg align B2.tif B3.tif B4.tif B8.tif -o aligned/
   geodelreg check ms.tif pan.tif
+  geodelreg batch pairs.csv
   geodelreg align --help
 
 \b
@@ -45,6 +47,7 @@ Exit codes:
   2  wrong usage
   3  refused: the evidence supports no alignment, nothing was written; check: cannot tell
   4  check: misaligned
+batch: that of its worst pair, failures first
 """
 
 

@@ -22,7 +22,7 @@ from geodelreg_cli.console import configure_logging
 _Options = TypeVar("_Options")
 
 RUN = "Run"
-UNITS = {"_px": "PX", "_deg": "DEG"}
+UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
 TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": click.BOOL}
 # Flags that GDAL's users know by another name than the knob's.
 FLAGS = {
@@ -30,6 +30,7 @@ FLAGS = {
     "masks": ("--mask",),
     "pan_masks": ("--pan-mask",),
     "threads": ("-j", "--num-threads"),
+    "workers": ("-j", "--workers"),
     "driver": ("--of",),
     "creation_options": ("--co",),
     "warp_grid": ("--grid",),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -95,8 +96,13 @@ def trim_heap() -> None:
 
 @contextmanager
 def gdal_calls() -> Iterator[None]:
-    """Wrap calls into GDAL: its messages go to the ``rasterio`` logger of this thread."""
+    """Wrap calls into GDAL: its messages go to the ``rasterio`` logger of this thread.
+
+    It decodes in as many threads as the variable ``GDAL_NUM_THREADS`` says, by default on all
+    cores.
+    """
     import rasterio
 
-    with rasterio.Env(GTIFF_IMPLICIT_JPEG_OVR=False, GDAL_NUM_THREADS="ALL_CPUS"):
+    threads = os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS")
+    with rasterio.Env(GTIFF_IMPLICIT_JPEG_OVR=False, GDAL_NUM_THREADS=threads):
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,8 @@ CACHE_BYTES = 64_000_000
 def gdal_session(source: Path) -> Iterator[None]:
     """Bound GDAL's block cache, use all cores, keep masks inside TIFFs and write no statistics.
 
+    The variable ``GDAL_NUM_THREADS`` counts more than the number of cores.
+
     Raises
     ------
     RasterUnreadableError
@@ -28,7 +31,7 @@ def gdal_session(source: Path) -> Iterator[None]:
         cache = min(int(get_gdal_config("GDAL_CACHEMAX")), CACHE_BYTES)
     with rasterio.Env(
         GDAL_CACHEMAX=cache,
-        GDAL_NUM_THREADS="ALL_CPUS",
+        GDAL_NUM_THREADS=os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
         GDAL_TIFF_INTERNAL_MASK=True,
         GTIFF_IMPLICIT_JPEG_OVR=False,
     ):

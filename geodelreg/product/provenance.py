@@ -103,6 +103,19 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
     return {f"GEODELREG_{name}": text for name, text in sorted(tags.items()) if text}
 
 
+def written_tags(path: Path) -> dict[str, str]:
+    """``GEODELREG_*`` tags that a raster carries; none when it is no raster of geodelreg's."""
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.open(path) as dataset:
+            tags = dataset.tags()
+    except RasterioError:
+        return {}
+    return {name: text for name, text in tags.items() if name.startswith("GEODELREG_")}
+
+
 def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 

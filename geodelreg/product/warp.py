@@ -299,7 +299,7 @@ def _warped(view: Any, grid: Grid, validity: _Validity, resampling: str) -> Iter
         resampling=Resampling[_RASTERIO_NAMES.get(resampling, resampling)],
         tolerance=_TOLERANCE_PX,
         UNIFIED_SRC_NODATA="PARTIAL",  # each band has its own gaps
-        NUM_THREADS="ALL_CPUS",
+        NUM_THREADS=os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
         **settings,
     ) as warped:
         yield warped

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 HEAVY = {
-    "affine", "cv2", "dask", "jinja2", "matplotlib", "numpy", "pyproj", "rasterio", "rich", "scipy",
-    "shapely",
+    "affine", "cv2", "dask", "distributed", "jinja2", "matplotlib", "numpy", "pyproj", "rasterio",
+    "rich", "scipy", "shapely",
 }  # fmt: skip
 
 
@@ -28,6 +28,7 @@ def modules_after(statement: str) -> set[str]:
         ["--version"],
         ["--help"],
         ["align", "--help"],
+        ["batch", "--help"],
         ["check", "--help"],
         ["gcps", "--help"],
         ["revert", "-h"],
@@ -42,3 +43,8 @@ def test_help_and_version_load_nothing_heavy(args: list[str]) -> None:
 def test_importing_the_library_or_the_rio_plugin_loads_nothing_heavy() -> None:
     assert not modules_after("import geodelreg, geodelreg.errors, geodelreg.options") & HEAVY
     assert not modules_after("import geodelreg_cli.rio") & HEAVY
+
+
+def test_a_driver_of_many_pairs_and_its_workers_load_nothing_heavy() -> None:
+    statement = "from geodelreg.batch import run; import geodelreg.batch.child"
+    assert not modules_after(statement) & HEAVY

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import signal
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,10 @@ import pytest
 import rasterio
 from affine import Affine
 
-from geodelreg import AlignOptions, align, errors
+from geodelreg import AlignOptions, __version__, align, errors
+from geodelreg.batch import run
+from geodelreg.batch.job import Pair, Task
+from geodelreg.batch.supervisor import Child
 from geodelreg.errors import GeodelregError
 from geodelreg.image.reader import open_raster
 from geodelreg.options import WriteOptions
@@ -84,6 +90,38 @@ def without_matplotlib(folder: Path) -> object:
         return check_drawable(folder / "figure.png")
 
 
+def listed(folder: Path, *rows: dict[str, str], **settings: Any) -> list[object]:
+    return list(run(rows, out_root=folder, **settings))
+
+
+ROW = {"ms": "ms.tif", "pan": "pan.tif", "out": "out.tif"}
+
+
+def with_existing_ledger(folder: Path) -> object:
+    (folder / "batch.ledger").touch()
+    return listed(folder, ROW)
+
+
+def without_workers(folder: Path) -> object:
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    return listed(folder, ROW, executor=executor)
+
+
+def in_child(
+    folder: Path,
+    timeout_s: float | None = None,
+    memory_mb: int | None = None,
+    killed: bool = False,
+) -> object:
+    pair = Pair((str(raster(folder, "ms.tif")),), str(raster(folder, "pan.tif")))
+    task = Task(1, pair, "check", 0.5, timeout_s, memory_mb, {}, __version__)
+    child = Child({})
+    if killed:
+        os.kill(child.pid, signal.SIGKILL)
+    return child.run(task)
+
+
 @dataclass(frozen=True)
 class Case:
     """What provokes an error, and which of these words its cause must name."""
@@ -132,6 +170,16 @@ CASES = {
         ("qa.tif",),
     ),
     errors.MissingExtraError: Case(without_matplotlib, ("matplotlib",)),
+    errors.ManifestError: Case(
+        lambda folder: listed(folder, {**ROW, "model": "x"}), ("row 1", "model")
+    ),
+    errors.LedgerError: Case(with_existing_ledger, ("batch.ledger",)),
+    errors.ClusterError: Case(without_workers, ("executor",)),
+    errors.PairTimeoutError: Case(
+        lambda folder: in_child(folder, timeout_s=0.01), ("ms.tif", "0.01 s")
+    ),
+    errors.PairMemoryError: Case(lambda folder: in_child(folder, memory_mb=9), ("ms.tif", "9 MB")),
+    errors.PairCrashedError: Case(lambda folder: in_child(folder, killed=True), ("ms.tif",)),
     errors.AlignmentRefusedError: Case(aligned, ("ms.tif", "pan.tif")),
 }
 

@@ -57,7 +57,8 @@ def test_wheel_names_version_and_entry_points(wheel: zipfile.ZipFile) -> None:
     info = f"geodelreg-{geodelreg.__version__}.dist-info"
     metadata = email.message_from_bytes(wheel.read(f"{info}/METADATA"))
     assert metadata["Version"] == geodelreg.__version__
-    assert {"test", "dev", "report", "batch"} <= set(metadata.get_all("Provides-Extra"))
+    extras = {"test", "dev", "report", "batch", "parquet", "vector"}
+    assert extras <= set(metadata.get_all("Provides-Extra"))
     entry_points = configparser.ConfigParser()
     entry_points.read_string(wheel.read(f"{info}/entry_points.txt").decode())
     assert dict(entry_points["console_scripts"]) == {"geodelreg": "geodelreg_cli.main:main"}
