@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from geodelreg import errors
     from geodelreg.api import align, check, export_gcps, revert, write, write_in_place
-    from geodelreg.options import AlignOptions, WriteOptions
+    from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
+    from geodelreg.sharpen import pansharpen
     from geodelreg.types import Alignment
 
 __version__ = "0.1.0"
@@ -21,12 +22,14 @@ __all__ = [
     "AlignOptions",
     "Alignment",
     "Check",
+    "PansharpenOptions",
     "WriteOptions",
     "__version__",
     "align",
     "check",
     "errors",
     "export_gcps",
+    "pansharpen",
     "revert",
     "write",
     "write_in_place",
@@ -36,10 +39,12 @@ _HOMES = {
     "AlignOptions": "geodelreg.options",
     "Alignment": "geodelreg.types",
     "Check": "geodelreg.product.check",
+    "PansharpenOptions": "geodelreg.options",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
     "check": "geodelreg.api",
     "export_gcps": "geodelreg.api",
+    "pansharpen": "geodelreg.sharpen",
     "revert": "geodelreg.api",
     "write": "geodelreg.api",
     "write_in_place": "geodelreg.api",

@@ -60,7 +60,7 @@ def _open(
         open_raster(source, options.masks, allow=options.allow) as ms,
         open_raster(reference, options.pan_masks, allow=options.allow) as pan,
     ):
-        yield _Rasters(ms, pan, _paths(source), str(reference))
+        yield _Rasters(ms, pan, paths_of(source), str(reference))
 
 
 def align(
@@ -258,7 +258,8 @@ def _alignment(rasters: _Rasters, pair: Pair, solution: Solution) -> Alignment:
     )
 
 
-def _paths(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
+def paths_of(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
+    """Names of the MS files."""
     if isinstance(source, str) or hasattr(source, "__fspath__"):
         return (str(source),)
     return tuple(str(path) for path in source)
@@ -293,7 +294,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     tags = provenance_tags(alignment)
     notes: list[str] = []
     for path, out in _targets(alignment, Path(target)):
-        correction, gcps = _of_file(alignment, path)
+        correction, gcps = correction_of_file(alignment, path)
         if options.warp:
             notes += write_warped(path, out, correction, alignment.reference, tags, options)
         else:
@@ -323,7 +324,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     tags = provenance_tags(alignment)
     notes: list[str] = []
     for name in alignment.source_paths:
-        notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
+        notes += edit_in_place(Path(name), *correction_of_file(alignment, Path(name)), tags)
     return notes
 
 
@@ -358,10 +359,8 @@ def export_gcps(
     """
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
-    context = gcp_context(alignment)
-    write_gcps(
-        Path(path), gcps_from_alignment(alignment), format, context=context, overwrite=overwrite
-    )
+    gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
+    write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 
 
 def _targets(alignment: Alignment, target: Path) -> list[tuple[Path, Path]]:
@@ -379,7 +378,7 @@ def _targets(alignment: Alignment, target: Path) -> list[tuple[Path, Path]]:
     return [(path, target / path.name) for path in sources]
 
 
-def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
+def correction_of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
     """Correction and GCPs of one MS file; files on other grids share the ground, not the pixels."""
     from geodelreg.product.gcps import gcps_from_alignment
 

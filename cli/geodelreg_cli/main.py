@@ -25,6 +25,7 @@ COMMANDS = {
     "align": ("geodelreg_cli.align", "Correct the georeferencing of MS so that it fits PAN."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
+    "pansharpen": ("geodelreg_cli.pansharpen", "Align MS, then sharpen it with PAN."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
 }
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.masking import flag_bands
-from geodelreg.options import WriteOptions
+from geodelreg.options import PansharpenOptions, WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.header import Provenance, merged_domains
@@ -132,7 +132,7 @@ def gdal_write(source: Path, target: Path, driver: str) -> Iterator[None]:
         ) from error
 
 
-def user_creation(options: WriteOptions) -> dict[str, str]:
+def user_creation(options: WriteOptions | PansharpenOptions) -> dict[str, str]:
     """Creation options of the user, by upper-case key."""
     pairs = (option.split("=", 1) for option in options.creation_options)
     return {key.strip().upper(): value.strip() for key, value in pairs}
