@@ -13,8 +13,9 @@ from geodelreg.version import __version__
 if TYPE_CHECKING:
     from geodelreg import errors
     from geodelreg.api import align, check
-    from geodelreg.options import AlignOptions, WriteOptions
+    from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
+    from geodelreg.sharpen import pansharpen
     from geodelreg.values.result import Alignment
     from geodelreg.writing import export_gcps, revert, write, write_in_place
 
@@ -23,12 +24,14 @@ __all__ = [
     "AlignOptions",
     "Alignment",
     "Check",
+    "PansharpenOptions",
     "WriteOptions",
     "__version__",
     "align",
     "check",
     "errors",
     "export_gcps",
+    "pansharpen",
     "revert",
     "write",
     "write_in_place",
@@ -38,10 +41,12 @@ _HOMES = {
     "AlignOptions": "geodelreg.options",
     "Alignment": "geodelreg.values.result",
     "Check": "geodelreg.product.check",
+    "PansharpenOptions": "geodelreg.options",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
     "check": "geodelreg.api",
     "export_gcps": "geodelreg.writing",
+    "pansharpen": "geodelreg.sharpen",
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
     "write_in_place": "geodelreg.writing",

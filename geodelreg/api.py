@@ -24,7 +24,7 @@ from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution
 from geodelreg.values.timings import Timings
-from geodelreg.writing import AnyPath
+from geodelreg.writing import AnyPath, paths_of
 
 MAX_LIMIT_PX = 1e6
 
@@ -54,7 +54,7 @@ def _open(
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
-            inputs = _input(ms, _paths(source)), _input(pan, (str(reference),))
+            inputs = _input(ms, paths_of(source)), _input(pan, (str(reference),))
         yield _Rasters(ms, pan, *inputs, timings)
 
 
@@ -219,9 +219,3 @@ def _alignment(
         versions=versions(with_proj=pair.through_proj or bool(masks)),
         timings_s={**pair.timings, "total": pair.timings.elapsed_s},
     )
-
-
-def _paths(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
-    if isinstance(source, str) or hasattr(source, "__fspath__"):
-        return (str(source),)
-    return tuple(str(path) for path in source)

@@ -19,6 +19,7 @@ BEYOND_A_HEADER = ("projective",)
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
+EXTENTS = ("pan", "intersection")
 RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
 
 
@@ -241,3 +242,80 @@ class BatchOptions:
         _check_range(self, "memory_mb", 1, 1e9)
         if self.check and self.in_place:
             raise UsageError("--check and --in-place exclude each other", "Drop one of them.")
+
+
+@dataclass(frozen=True, slots=True)
+class PansharpenOptions:
+    """How the sharpened raster is made and written."""
+
+    overwrite: bool = _knob(False, "Replace existing outputs; without it they are an error.")
+    driver: str | None = _knob(
+        None,
+        "GTiff, COG (with overviews) or VRT, which is lazy and names its sources; by the extension "
+        "of OUT when not given.",
+    )
+    creation_options: tuple[str, ...] = _knob(
+        (), "Creation option of the format, KEY=VALUE, as in GDAL; may be repeated."
+    )
+    resampling: str = _knob("cubic", "Resampling of MS onto the grid of PAN.", RESAMPLINGS)
+    weights: str = _knob(
+        "auto",
+        "Weights of the sharpened bands in the image that PAN is divided by: auto fits them so "
+        "that together the bands look like PAN; equal; or numbers, W1,W2,...",
+    )
+    bands: str = _knob(
+        "all", "Bands of MS to sharpen, from 1, as N,N,...; all but alpha otherwise."
+    )
+    extent: str = _knob(
+        "pan", "pan: all of PAN's grid; intersection: its window that MS covers.", EXTENTS
+    )
+    nodata: float | None = _knob(
+        None, "No-data value of OUT; that of MS when not given, or a mask where MS has none."
+    )
+    bit_depth: int | None = _knob(
+        None, "Significant bits of the values (12 clips at 4095), for types with more of them."
+    )
+
+    def __post_init__(self) -> None:
+        _check_choice(self, "resampling")
+        _check_choice(self, "extent")
+        _check_range(self, "bit_depth", 1, 32)
+        for option in self.creation_options:
+            if "=" not in option:
+                raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+        if self.weights not in ("auto", "equal"):
+            self.given_weights()
+        self.given_bands()
+
+    def given_weights(self) -> tuple[float, ...]:
+        """The weights as numbers.
+
+        Raises
+        ------
+        UsageError
+            They are none, or sum up to nothing.
+        """
+        try:
+            values = tuple(float(text) for text in self.weights.split(","))
+        except ValueError:
+            values = ()
+        if not values or not all(0 <= value < float("inf") for value in values) or not sum(values):
+            raise UsageError(
+                f"weights = {self.weights!r} are no weights",
+                "Use auto, equal, or numbers of at least 0 such as 0.3,0.5,0.2.",
+            )
+        return values
+
+    def given_bands(self) -> tuple[int, ...]:
+        """Numbers of the bands, from 1; none when all are meant.
+
+        Raises
+        ------
+        UsageError
+        """
+        if self.bands == "all":
+            return ()
+        numbers = self.bands.split(",")
+        if not all(text.strip().isdigit() and int(text) > 0 for text in numbers):
+            raise UsageError(f"bands = {self.bands!r} are no bands", "Use numbers such as 1,2,3.")
+        return tuple(int(text) for text in numbers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from os import PathLike
@@ -20,6 +20,13 @@ from geodelreg.values.points import Gcp
 from geodelreg.values.result import Alignment, Correction, Outcome
 
 AnyPath = str | PathLike[str]
+
+
+def paths_of(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
+    """Names of one MS file or several."""
+    if isinstance(source, str) or hasattr(source, "__fspath__"):
+        return (str(source),)
+    return tuple(str(path) for path in source)
 
 
 @as_allowed
@@ -65,7 +72,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
         for path, out in pairs:
             check_replaceable(out, options.overwrite, stale_beside(out, path))
         for path, out in pairs:
-            correction, gcps = _of_file(alignment, path)
+            correction, gcps = correction_of_file(alignment, path)
             if options.warp:
                 notes += write_warped(
                     path, out, correction, alignment.reference.grid, tags, options, pan
@@ -100,7 +107,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     notes: list[str] = []
     with together(map(Path, alignment.source.paths)):
         for name in alignment.source.paths:
-            notes += edit_in_place(Path(name), *_of_file(alignment, Path(name)), tags)
+            notes += edit_in_place(Path(name), *correction_of_file(alignment, Path(name)), tags)
     return notes
 
 
@@ -205,7 +212,7 @@ def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Pa
         raise
 
 
-def _of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
+def correction_of_file(alignment: Alignment, path: Path) -> tuple[Correction, tuple[Gcp, ...]]:
     """Correction and GCPs of one MS file; files on other grids share the ground, not the pixels."""
     from geodelreg.product.gcps import gcps_from_alignment
 

@@ -27,6 +27,7 @@ COMMANDS = {
     "batch": ("geodelreg_cli.batch", "Align or check many pairs, with a ledger; also on Dask."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
+    "pansharpen": ("geodelreg_cli.pansharpen", "Align MS, then sharpen it with PAN."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
 }
 

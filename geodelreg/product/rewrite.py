@@ -15,7 +15,7 @@ from geodelreg.door.names import LOCAL, refuse
 from geodelreg.door.opening import allowed, open_raster
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.masking import flag_bands
-from geodelreg.options import WriteOptions
+from geodelreg.options import PansharpenOptions, WriteOptions
 from geodelreg.product import compare, metadata, sidecars
 from geodelreg.product.environment import gdal_failures
 from geodelreg.product.header import Provenance, merged_domains
@@ -149,7 +149,7 @@ def gdal_write(source: Path, target: Path, driver: str) -> Iterator[None]:
         ) from error
 
 
-def user_creation(options: WriteOptions) -> dict[str, str]:
+def user_creation(options: WriteOptions | PansharpenOptions) -> dict[str, str]:
     """Creation options of the user, by upper-case key."""
     pairs = (option.split("=", 1) for option in options.creation_options)
     return {key.strip().upper(): value.strip() for key, value in pairs}

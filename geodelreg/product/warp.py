@@ -30,18 +30,20 @@ from geodelreg.product.view import corrected_view
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction
 
-_TOLERANCE_PX = 1e-3
+TOLERANCE_PX = 1e-3
 """Of GDAL's approximation of the way between two CRSs."""
 
 _BLOCK_PX = 256
 _SNAP_PX = 1e-6
 _EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
+"""Of resamplings whose name in rasterio is not GDAL's."""
+
 _NOT_CARRIED = metadata.GDAL_DOMAINS | {"GEOLOCATION"}
 
 
 @dataclass(frozen=True, slots=True)
-class _Validity:
+class Validity:
     """How pixels without a value are marked: by a value, by the alpha band, or by a mask."""
 
     nodata: float | None = None
@@ -49,10 +51,12 @@ class _Validity:
 
     @property
     def is_mask(self) -> bool:
+        """Neither a value nor the alpha band."""
         return self.nodata is None and self.alpha_band is None
 
     @classmethod
-    def of(cls, dataset: Any) -> _Validity:
+    def of(cls, dataset: Any) -> Validity:
+        """How an open raster marks them."""
         from rasterio.enums import ColorInterp, MaskFlags
 
         if dataset.count > 1 and dataset.colorinterp[-1] is ColorInterp.alpha:
@@ -210,14 +214,14 @@ def _warp(
     notes: list[str] = []
     with corrected_view(source, content, mask_rules=True) as (name, _), open_raster(name) as view:
         resampling, flags = _resampling(source, view, options, notes)
-        validity = _Validity.of(view)
+        validity = Validity.of(view)
         if len({repr(value) for value in view.nodatavals}) > 1:
             notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
         profile = _profile(view, grid, validity)
         profile |= {key.lower(): value for key, value in creation.items()}
         with (
-            _warped(view, grid, validity, resampling) as warped,
-            _warped(view, grid, validity, "nearest") if flags else nullcontext() as nearest,
+            warped_onto(view, grid, validity, resampling) as warped,
+            warped_onto(view, grid, validity, "nearest") if flags else nullcontext() as nearest,
             rasterio.open(out, "w", **profile) as dataset,
         ):
             _annotate(view, dataset)
@@ -249,7 +253,7 @@ def _resampling(
     return options.resampling, flags
 
 
-def _profile(view: Any, grid: Grid, validity: _Validity) -> dict[str, Any]:
+def _profile(view: Any, grid: Grid, validity: Validity) -> dict[str, Any]:
     from rasterio.enums import ColorInterp
 
     kinds = {np.dtype(compare.numpy_type(name)).kind for name in view.dtypes}
@@ -280,7 +284,8 @@ def _profile(view: Any, grid: Grid, validity: _Validity) -> dict[str, Any]:
 
 
 @contextmanager
-def _warped(view: Any, grid: Grid, validity: _Validity, resampling: str) -> Iterator[Any]:
+def warped_onto(view: Any, grid: Grid, validity: Validity, resampling: str) -> Iterator[Any]:
+    """An open raster on a grid, resampled when read; its masks say what is covered."""
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
@@ -297,7 +302,7 @@ def _warped(view: Any, grid: Grid, validity: _Validity, resampling: str) -> Iter
         width=width,
         height=height,
         resampling=Resampling[_RASTERIO_NAMES.get(resampling, resampling)],
-        tolerance=_TOLERANCE_PX,
+        tolerance=TOLERANCE_PX,
         UNIFIED_SRC_NODATA="PARTIAL",  # each band has its own gaps
         NUM_THREADS=os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
         **settings,
@@ -329,7 +334,7 @@ def _copy_colormaps(view: Any, dataset: Any) -> None:
 
 
 def _copy_pixels(
-    warped: Any, nearest: Any, flags: Sequence[int], dataset: Any, validity: _Validity
+    warped: Any, nearest: Any, flags: Sequence[int], dataset: Any, validity: Validity
 ) -> None:
     for window in compare.windows_of(dataset):
         data = warped.read(window=window)

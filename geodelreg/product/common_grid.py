@@ -1,0 +1,150 @@
+"""MS files and PAN laid onto one grid, lazily: virtual rasters that GDAL reads when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from geodelreg.door.opening import open_raster
+from geodelreg.errors import NoOverlapError
+from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.crs import map_points
+from geodelreg.product.header import Provenance
+from geodelreg.product.view import corrected_view
+from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Correction
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpening:
+    """What is sharpened with what.
+
+    Attributes
+    ----------
+    sources : sequence of (Path, Correction)
+        MS files and where their pixels lie.
+    reference : Path
+    pan_band : int
+        Band of `reference`, from 1.
+    bands : sequence of (int, int)
+        The spectral bands: number of the file, from 0, and of the band in it, from 1.
+    """
+
+    sources: Sequence[tuple[Path, Correction]]
+    reference: Path
+    pan_band: int
+    bands: Sequence[tuple[int, int]]
+
+
+def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
+    """PAN's grid, or the window of it that covers what MS and PAN share."""
+    grid = Grid(pan.transform, pan.shape, pan.crs.to_wkt())
+    if extent == "pan":
+        return grid
+    low, high = np.zeros(2), np.array(pan.shape[::-1], dtype=np.float64)
+    for path, correction in what.sources:
+        edge = apply_affine(correction.corrected, _outline(path))
+        ground = map_points(edge, correction.crs_wkt, grid.crs_wkt)
+        seen = apply_affine(~pan.transform, ground)
+        seen = seen[np.isfinite(seen).all(axis=1)]
+        if len(seen):
+            low, high = np.maximum(low, seen.min(axis=0)), np.minimum(high, seen.max(axis=0))
+    first, last = np.floor(low + TOLERANCE_PX), np.ceil(high - TOLERANCE_PX)
+    if (last <= first).any():
+        raise NoOverlapError(
+            f"{what.sources[0][0]} and {what.reference} share no ground",
+            "Check that both show the same place, or use --extent pan.",
+        )
+    width, height = (int(n) for n in last - first)
+    moved = pan.transform @ Affine.translation(*map(float, first))
+    return Grid(moved, (height, width), grid.crs_wkt)
+
+
+def _outline(path: Path) -> NDArray[np.float64]:
+    """(64, 2) pixels along the edges of a raster."""
+    with open_raster(path) as dataset:
+        width, height = dataset.width, dataset.height
+    t = np.linspace(0.0, 1.0, 16)
+    sides = [(t * width, 0 * t), (t * width, 0 * t + height), (0 * t, t * height)]
+    sides.append((0 * t + width, t * height))
+    return np.concatenate([np.stack(side, axis=1) for side in sides])
+
+
+@contextmanager
+def on_grid(what: Sharpening, grid: Grid, resampling: str) -> Iterator[list[Any]]:
+    """The MS files, where their corrections put them, resampled onto a grid when read."""
+    with ExitStack() as stack:
+        files = []
+        for path, correction in what.sources:
+            view = corrected_view(path, Provenance(correction, (), {}), mask_rules=True)
+            name, _ = stack.enter_context(view)
+            dataset = stack.enter_context(open_raster(name))
+            warped = warped_onto(dataset, grid, Validity.of(dataset), resampling)
+            files.append(stack.enter_context(warped))
+        yield files
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Everything on one grid, as files that GDAL reads when pixels are asked for.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the virtual rasters.
+    files : list of Path
+        Virtual raster of each MS file.
+    pan : (Path, int)
+        PAN and its band.
+    covers : list of (Path, int)
+        Bands whose masks, all together, say what is covered.
+    """
+
+    folder: Path
+    files: list[Path]
+    pan: tuple[Path, int]
+    covers: list[tuple[Path, int]]
+
+
+def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recipe:
+    """Write virtual rasters beside `out` that lay everything onto the grid."""
+    import rasterio
+    import rasterio.shutil
+
+    files = [out.with_name(f"{out.name}.ms{n}.vrt") for n in range(1, len(what.sources) + 1)]
+    covers: list[tuple[Path, int]] = []
+    with on_grid(what, grid, resampling) as warped:
+        for number, (path, lazy) in enumerate(zip(files, warped, strict=True)):
+            rasterio.shutil.copy(lazy, path, driver="VRT")
+            _name_source(path, what.sources[number][0])
+            used = [band for file, band in what.bands if file == number]
+            covers += [(path, band) for band in (used if lazy.nodata is not None else used[:1])]
+    pan = (what.reference, what.pan_band)
+    with open_raster(what.reference) as dataset:
+        flags = {flag.name for flag in dataset.mask_flag_enums[what.pan_band - 1]}
+        if "all_valid" not in flags or grid.shape != dataset.shape:
+            pan = (out.with_name(f"{out.name}.pan.vrt"), what.pan_band)
+            with warped_onto(dataset, grid, Validity.of(dataset), "nearest") as lazy:
+                rasterio.shutil.copy(lazy, pan[0], driver="VRT")
+            _name_source(pan[0], what.reference)
+            covers.append(pan)
+    return Recipe(out.parent, files, pan, covers)
+
+
+def _name_source(vrt: Path, source: Path) -> None:
+    """Let a warped VRT read the file itself; where its pixels lie stands in the VRT."""
+    text = vrt.read_text(encoding="utf-8")
+    head, _, rest = text.partition("<SourceDataset")
+    _, _, tail = rest.partition("</SourceDataset>")
+    name = escape(str(source if str(source).startswith("/vsi") else source.absolute()))
+    named = f'<SourceDataset relativeToVRT="0">{name}</SourceDataset>'
+    vrt.write_text(head + named + tail, encoding="utf-8")

@@ -1,0 +1,108 @@
+"""What users call to sharpen MS with PAN, aligned or as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from geodelreg.door.names import as_path
+from geodelreg.errors import UsageError
+from geodelreg.fine.band_weights import robust_band_weights
+from geodelreg.image.reader import check_band, open_raster
+from geodelreg.options import PansharpenOptions, check_header_holds
+from geodelreg.pair import Progress
+from geodelreg.product.common_grid import Sharpening
+from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
+from geodelreg.product.provenance import provenance_tags
+from geodelreg.values.result import Alignment, Correction
+from geodelreg.writing import AnyPath, correction_of_file, paths_of
+
+
+def pansharpen(
+    source: AnyPath | Sequence[AnyPath],
+    reference: AnyPath,
+    target: AnyPath,
+    options: PansharpenOptions | None = None,
+    *,
+    alignment: Alignment | None = None,
+    allow: str = "local",
+    pan_band: int = 1,
+    progress: Progress | None = None,
+) -> list[str]:
+    """Sharpen MS with PAN on PAN's exact grid, with GDAL's weighted Brovey.
+
+    Parameters
+    ----------
+    source : path or sequence of paths
+        The MS raster, or one file per band.
+    reference : path
+        The PAN raster.
+    target : path
+        GeoTIFF, COG or VRT.
+    options : PansharpenOptions, optional
+    alignment : Alignment, optional
+        Of these rasters, as returned by `align`; without it MS lies where its header says.
+    allow : str
+        What names of rasters may open, as in `AlignOptions`.
+    pan_band : int
+        Band of PAN, from 1.
+    progress : callable, optional
+        Called with a fraction 0 to 1 and the name of the step.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    OutputExistsError, OutputIsInputError, OutputUnwritableError, NoOverlapError, UsageError, ...
+        Nothing is then changed on disk.
+    """
+    options = options or PansharpenOptions()
+    if alignment is not None:
+        check_header_holds(alignment.options.model)
+    paths = [as_path(path) for path in paths_of(source)]
+    placed = [
+        (
+            path,
+            _as_it_is(path, allow) if alignment is None else correction_of_file(alignment, path)[0],
+        )
+        for path in paths
+    ]
+    with open_raster(reference, allow=allow) as pan:
+        check_band(pan, pan_band)
+    bands = spectral_bands(paths, options.given_bands())
+    what = Sharpening(placed, Path(reference), pan_band, bands)
+    weights = _weights(what, options)
+    tags = {} if alignment is None else provenance_tags(alignment)
+    return write_pansharpened(what, Path(target), weights, tags, options, progress)
+
+
+def _as_it_is(path: Path, allow: str) -> Correction:
+    with open_raster(path, allow=allow) as reader:
+        grid = reader.grid
+    return Correction("none", grid.crs_wkt, grid.transform, grid.transform)
+
+
+def _weights(what: Sharpening, options: PansharpenOptions) -> list[float]:
+    """Weights of the spectral bands; fitted ones are scaled so that the values of MS are kept."""
+    count = len(what.bands)
+    if options.weights not in ("auto", "equal"):
+        given = options.given_weights()
+        if len(given) != count:
+            raise UsageError(
+                f"weights = {options.weights!r} are {len(given)}, and {count} bands are sharpened",
+                "Give one weight to each band, or use auto.",
+            )
+        return list(given)
+    if options.weights == "equal":
+        return [1.0 / count] * count
+    bands, pan = matched_samples(what)
+    weights = robust_band_weights(bands, pan)[0] if len(pan) else np.zeros(count)
+    brightness = float((weights @ bands).mean()) if weights.any() else 0.0
+    if brightness <= 0:
+        return [1.0 / count] * count
+    return [float(weight) for weight in weights * (float(pan.mean()) / brightness)]
