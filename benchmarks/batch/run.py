@@ -184,10 +184,9 @@ def _of_kills(kills: dict[str, Any]) -> list[Promise]:
 
 def _of_large(large: dict[str, Any]) -> list[Promise]:
     label = f"{large['pairs']:,} pairs".replace(",", " ")
-    size = 1e6 * large["ledger_mb"] / large["pairs"]
     plan_s, peak_mb, ledger_ms = (large[n] for n in ("plan_s", "peak_mb", "ledger_ms_per_pair"))
     rate, cpu_ms = large["pairs"] / large["run_s"], large["run_cpu_ms_per_pair"]
-    ledger = f"{ledger_ms:.2f} ms, {size:.0f} bytes on the disk"
+    ledger = f"{ledger_ms:.2f} ms"
     through = f"{rate:.0f} pairs/s, {cpu_ms:.2f} ms of the driver's CPU"
     return [
         (f"{label}: driver ≤ 500 MB", f"{peak_mb:.0f} MB", peak_mb <= MOST_MB),

@@ -41,7 +41,7 @@ CREATE TABLE outcomes (
     finished TEXT NOT NULL,
     result TEXT NOT NULL,
     PRIMARY KEY (number, run)
-) WITHOUT ROWID;
+);
 """
 _AT_ONCE = 256
 
