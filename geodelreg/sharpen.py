@@ -30,7 +30,7 @@ def pansharpen(
     allow: str = "local",
     pan_band: int = 1,
     progress: Progress | None = None,
-) -> list[str]:
+) -> None:
     """Sharpen MS with PAN on PAN's exact grid, with GDAL's weighted Brovey.
 
     Parameters
@@ -50,11 +50,6 @@ def pansharpen(
         Band of PAN, from 1.
     progress : callable, optional
         Called with a fraction 0 to 1 and the name of the step.
-
-    Returns
-    -------
-    list of str
-        Warnings.
 
     Raises
     ------
@@ -78,7 +73,7 @@ def pansharpen(
     what = Sharpening(placed, Path(reference), pan_band, bands)
     weights = _weights(what, options)
     tags = {} if alignment is None else provenance_tags(alignment)
-    return write_pansharpened(what, Path(target), weights, tags, options, progress)
+    write_pansharpened(what, Path(target), weights, tags, options, progress)
 
 
 def _as_it_is(path: Path, allow: str) -> Correction:

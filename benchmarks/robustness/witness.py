@@ -6,7 +6,6 @@ server of our own, and ``strace`` sees what GDAL does behind Python's back.
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import http.server
 import os
@@ -217,7 +216,7 @@ def _paths(args: str, cwd: Path) -> Iterator[str]:
 def _unescaped(text: str) -> str:
     if "\\" not in text:
         return text
-    return os.fsdecode(ast.literal_eval(f'b"{text}"'))
+    return os.fsdecode(os.fsencode(text).decode("unicode_escape").encode("latin-1"))
 
 
 def judge(

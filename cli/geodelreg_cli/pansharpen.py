@@ -94,7 +94,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
         step = log_steps(bar)
         if not given["no_align"]:
             alignment = geodelreg.align(source, reference, align_options, progress=step)
-        notes = geodelreg.pansharpen(
+        geodelreg.pansharpen(
             source,
             reference,
             given["output"],
@@ -104,7 +104,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
             pan_band=align_options.pan_band,
             progress=step,
         )
-    for warning in (*(alignment.warnings if alignment else ()), *notes):
+    for warning in alignment.warnings if alignment else ():
         logging.getLogger(__name__).warning("warning: %s", warning)
     if alignment is not None and not given["quiet"]:
         from geodelreg.product.report import summary_text

@@ -76,14 +76,13 @@ def edit_in_place(
     raster = Path(os.path.realpath(path))
     check_editable(path)
     with together([raster]) as run, gdal_session(path), _opened(path, raster) as file:
-        scratch = run.lock(raster).scratch
-        edits = _recovered(raster, file, scratch)
+        edits = _recovered(raster, file, run.lock(raster).scratch)
         check_source(raster)
         notes = []
         if edits and edits[-1].state(raster, file) is State.FOREIGN:
             notes.append(f"{path}: changed by another program since; earlier edits stay for good")
             edits = []
-        edit = _planned(path, raster, file, content, scratch)
+        edit = _planned(path, raster, file, content)
         if _has_rpc(raster):
             notes.append(f"{path}: its RPCs do not know the correction; write to OUT to drop them")
         run.add_edit(raster, [*edits, edit])
@@ -174,7 +173,7 @@ def _recovered(raster: Path, file: BinaryIO, scratch: Path) -> list[Edit]:
     return edits
 
 
-def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance, scratch: Path) -> Edit:
+def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance) -> Edit:
     tiff = TiffFile(raster, file)
     structure = relayout.Structure.read(tiff)
     relayout.check_complete(tiff, structure)
@@ -200,7 +199,7 @@ def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance, scra
         compare.check_placement(name, path, content, _EXACT_PX)
         if reference is not None and reference.is_same(spatial_reference(name)):
             reference = None
-    if reference is not None and not is_kept_in_pam(reference, scratch):
+    if reference is not None and not is_kept_in_pam(reference):
         raise UnsafeInPlaceError(
             f"{path} would lose its coordinate reference system {reference.name}", _TO_OUT
         )

@@ -106,7 +106,7 @@ def write_pansharpened(
     tags: Mapping[str, str],
     options: PansharpenOptions,
     progress: Progress | None = None,
-) -> list[str]:
+) -> None:
     """Sharpen the spectral bands with PAN, on PAN's grid.
 
     Pixels that MS or PAN does not cover get the no-data value, or are masked where there is none.
@@ -123,11 +123,6 @@ def write_pansharpened(
     options : PansharpenOptions
     progress : callable, optional
         Called with a fraction 0 to 1 and the name of the step.
-
-    Returns
-    -------
-    list of str
-        Warnings.
 
     Raises
     ------
@@ -154,18 +149,18 @@ def write_pansharpened(
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), paths[0])
         with staged(target, overwrite=options.overwrite, stale=stale) as out:
             if driver == "VRT":
-                return _write_vrt(what, out, target, grid, weights, tags, options)
-            draft = out
-            if driver == "COG":
-                draft = out.parent.parent / "sharpened" / f"{out.stem}.tif"
-                draft.parent.mkdir()
+                _write_vrt(what, out, target, grid, weights, tags, options)
+                return
+            scratch = out.parent.parent / "scratch"
+            scratch.mkdir()
+            draft = scratch / f"{out.name}.tif" if driver == "COG" else out
+            lazy = scratch / f"{out.name}.vrt"
             with gdal_write(what.reference, target, driver):
-                notes = _write_tiff(what, draft, grid, weights, tags, options, progress)
+                _write_tiff(what, lazy, draft, grid, weights, tags, options, progress)
                 if driver == "COG":
                     creation = {"BIGTIFF": "IF_SAFER", "COMPRESS": "DEFLATE"}
                     creation |= user_creation(options)
                     rasterio.shutil.copy(draft, out, driver="COG", **creation)
-    return notes
 
 
 def _pansharpened_xml(
@@ -243,7 +238,7 @@ def _write_vrt(
     weights: Sequence[float],
     tags: Mapping[str, str],
     options: PansharpenOptions,
-) -> list[str]:
+) -> None:
     """The lazy raster, and beside it the virtual rasters that lay its sources onto the grid."""
     if options.nodata is not None or options.creation_options:
         raise UsageError(
@@ -258,7 +253,6 @@ def _write_vrt(
     folder = Path(os.path.realpath(target)).parent
     for path in [out, *out.parent.glob(f"{out.name}.*.vrt")]:
         _make_relative(path, folder)
-    return []
 
 
 def _make_relative(vrt: Path, folder: Path) -> None:
@@ -292,20 +286,18 @@ def _descriptions(what: Sharpening) -> list[str | None]:
 
 def _write_tiff(
     what: Sharpening,
+    lazy: Path,
     draft: Path,
     grid: Grid,
     weights: Sequence[float],
     tags: Mapping[str, str],
     options: PansharpenOptions,
     progress: Progress | None,
-) -> list[str]:
+) -> None:
     import rasterio
     from rasterio.windows import Window
 
-    work = draft.parent.parent / "recipe"
-    work.mkdir()
-    recipe = recipe_of(what, work / "sharp.vrt", grid, options.resampling)
-    lazy = work / "sharp.vrt"
+    recipe = recipe_of(what, lazy, grid, options.resampling)
     names = _descriptions(what)
     lazy.write_text(_pansharpened_xml(what, recipe, weights, options, names, {}), encoding="utf-8")
     height, width = grid.shape
@@ -330,7 +322,6 @@ def _write_tiff(
                 dataset.write(data, window=window)
                 if progress is not None:
                     progress(min(1.0, (top + _STRIP_ROWS) / height), "sharpening")
-    return []
 
 
 def _declared_nodata(what: Sharpening, sharp: Any) -> float | None:

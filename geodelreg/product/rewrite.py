@@ -13,7 +13,7 @@ from pathlib import Path
 from geodelreg.door.formats import FORMATS, needed_for
 from geodelreg.door.names import LOCAL, refuse
 from geodelreg.door.opening import allowed, open_raster
-from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.errors import LossyOutputError, OutputUnwritableError, UsageError
 from geodelreg.masking import flag_bands
 from geodelreg.options import PansharpenOptions, WriteOptions
 from geodelreg.product import compare, metadata, sidecars
@@ -41,6 +41,8 @@ def output_driver(target: Path, driver: str | None) -> str:
     ------
     UsageError
         It is unknown.
+    LossyOutputError
+        It makes many rasters of one.
     AccessNotAllowedError
         Files of that format can name others.
     """
@@ -68,7 +70,11 @@ def output_driver(target: Path, driver: str | None) -> str:
 
 
 def _openable(target: Path, driver: str) -> str:
-    """The driver, if what it writes may be opened again to be compared."""
+    """The driver, if what it writes is one raster that may be opened again to be compared."""
+    if driver == "netCDF":
+        raise LossyOutputError(
+            f"{target}: netCDF makes each band a raster of its own", "Choose another format."
+        )
     needed = needed_for(driver)
     if needed not in (LOCAL, allowed()):
         raise refuse(f"{target}: files of the format {driver} can open others", needed)

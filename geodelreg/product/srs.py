@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from xml.etree import ElementTree
 
@@ -92,28 +93,17 @@ def spatial_reference(path: Path | str) -> SpatialReference | None:
         return SpatialReference.of(dataset)
 
 
-def is_kept_in_pam(reference: SpatialReference, scratch: Path) -> bool:
-    """Whether GDAL reads a spatial reference from the PAM file beside a TIFF as it is.
-
-    Parameters
-    ----------
-    reference : SpatialReference
-    scratch : Path
-        Folder for a TIFF of one pixel; it is empty again afterwards.
-    """
+def is_kept_in_pam(reference: SpatialReference) -> bool:
+    """Whether GDAL reads a spatial reference from the PAM file beside a TIFF as it is."""
     import rasterio
 
-    probe = scratch / "probe.tif"
-    pam = sidecars.pam_path(probe)
-    transform = rasterio.Affine.translation(1.0, 1.0)
-    shape = {"width": 1, "height": 1, "count": 1, "dtype": "uint8", "transform": transform}
-    try:
-        rasterio.open(probe, "w", driver="GTiff", **shape).close()
-        pam.write_bytes(sidecars.with_srs(None, reference.element()))
+    shape = {"width": 1, "height": 1, "count": 1, "dtype": "uint8"}
+    with TemporaryDirectory() as folder:
+        probe = Path(folder, "probe.tif")
+        transform = rasterio.Affine.translation(1.0, 1.0)
+        rasterio.open(probe, "w", driver="GTiff", transform=transform, **shape).close()
+        sidecars.pam_path(probe).write_bytes(sidecars.with_srs(None, reference.element()))
         return reference.is_same(spatial_reference(probe))
-    finally:
-        probe.unlink(missing_ok=True)
-        pam.unlink(missing_ok=True)
 
 
 def keep(wanted: SpatialReference | None, out: Path, target: Path) -> list[str]:

@@ -254,7 +254,7 @@ def test_the_papers_methods_start_from_lowes_keypoints(tmp_path: Path) -> None:
     sift = cv2.SIFT.create(contrastThreshold=0.09, enable_precise_upscale=True)
     places = np.array([point.pt for point in sift.detect(grey, None)]) + 0.5
     found = judged(scene, "sift")
-    assert found.step_counts["keypoints PAN"] == len(places) > 1000
+    assert found.solution.step_counts["keypoints PAN"] == len(places) > 1000
     assert KDTree(places).query(found.tie_points.reference_px)[0].max() < 1e-3
 
 

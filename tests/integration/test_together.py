@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import rasterio
+from affine import Affine
 from pyproj import CRS
 
 import geodelreg
@@ -64,15 +65,16 @@ def bands(folder: Path) -> list[Path]:
     return [make_tiff(folder / name, shape=(40, 50), count=1) for name in BANDS]
 
 
-def found_for(paths: list[Path]) -> Alignment:
+def found_for(paths: list[Path], corrected: Affine | None = None) -> Alignment:
     """An alignment that moves all of `paths`, as `geodelreg.align` would return it."""
-    grid = Grid(TRANSFORM, (40, 50), WKT)
+    correction = correction_of(paths[0])
+    grid = Grid(correction.original, (40, 50), WKT)
     return alignment(
         source=grid,
         reference=grid,
         source_paths=tuple(map(str, paths)),
         reference_path="pan.tif",
-        corrected=correction_of(paths[0]).corrected,
+        corrected=corrected or correction.corrected,
     )
 
 
@@ -394,10 +396,7 @@ def test_kill_of_a_second_edit_takes_back_that_one_only(folder: Path) -> None:
     paths = bands(folder)
     geodelreg.write_in_place(found_for(paths))
     before = contents(folder)
-    second = replace(
-        found_for(paths),
-        correction=replace(correction_of(paths[0]), corrected=TRANSFORM @ SHIFT @ SHIFT),
-    )
+    second = found_for(paths, TRANSFORM @ SHIFT @ SHIFT)
     step, seen = 1, set()
     while run_killed(lambda: geodelreg.write_in_place(second), step, partly=True):
         tidy([paths[1]])
@@ -515,6 +514,8 @@ def test_kill_within_every_call_leaves_all_copies_or_none_to_the_next_run(folder
 KILLED_BETWEEN = """
 import os, signal, sys
 from pathlib import Path
+
+from affine import Affine
 import geodelreg_cli.main
 real, done = os.replace, []
 def replace(*args, **kwargs):

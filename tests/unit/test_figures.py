@@ -68,7 +68,7 @@ def test_a_tie_point_stands_on_its_pixel_in_both_images(tmp_path: Path) -> None:
     ms = band((30, 40), MS_HEADER @ Affine.translation(20, 20) @ Affine.scale(2.0))
     pan = band((320, 400), PAN_HEADER)
     path = tmp_path / "matches.png"
-    draw_matches(ms, pan, replace(made, tie_points=point), path)
+    draw_matches(ms, pan, replace(made, solution=replace(made.solution, tie_points=point)), path)
     image = pixels(path)
 
     dark = image.max(axis=2) < 60
@@ -113,7 +113,7 @@ def test_given_triangles_index_all_tie_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [(), (0,), (1, 2)])
 def test_too_few_points_for_a_mesh(tmp_path: Path, kept: tuple[int, ...]) -> None:
     made = alignment()
-    few = replace(made, tie_points=only(made.tie_points, *kept))
+    few = replace(made, solution=replace(made.solution, tie_points=only(made.tie_points, *kept)))
     ms, pan = band((80, 100), MS_HEADER), band((320, 400), PAN_HEADER)
     draw_matches(ms, pan, few, tmp_path / "few.png")
     assert (pixels(tmp_path / "few.png") < 60).any()
@@ -127,7 +127,7 @@ def test_points_on_one_line_have_no_mesh(tmp_path: Path) -> None:
     draw_matches(
         band((80, 100), MS_HEADER),
         band((320, 400), PAN_HEADER),
-        replace(made, tie_points=line),
+        replace(made, solution=replace(made.solution, tie_points=line)),
         tmp_path / "line.png",
     )
     assert (tmp_path / "line.png").exists()
@@ -142,7 +142,6 @@ def test_many_points_are_thinned_to_a_spread_of_lines(tmp_path: Path) -> None:
         np.tile(np.eye(2), (5000, 1, 1)),
         np.ones(5000),
         (rng.random(5000) < 0.3).astype(np.uint8),
-        np.zeros(5000, dtype=bool),
         rng.normal(0, 0.1, (5000, 2)),
     )
     made = alignment(tie_points=many)
@@ -206,18 +205,19 @@ def test_bands_without_a_valid_pixel_are_white(tmp_path: Path) -> None:
     assert pixels(tmp_path / "empty.png").mean() > 240
 
 
+def draw_sample(path: str | Path, **options: bool) -> None:
+    """The tie points of the sample on plain bands."""
+    bands = band((80, 100), MS_HEADER), band((320, 400), PAN_HEADER)
+    draw_matches(*bands, alignment(), path, **options)
+
+
 # --- files ---------------------------------------------------------------------------------------
-
-
-def draw(path: Path, overwrite: bool = False) -> None:
-    shown = band((80, 100), MS_HEADER), band((320, 400), PAN_HEADER)
-    draw_matches(*shown, alignment(), path, overwrite=overwrite)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_same_values_give_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     for name in ("one", "other"):
-        draw(tmp_path / f"{name}{suffix}")
+        draw_sample(tmp_path / f"{name}{suffix}")
     assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"other{suffix}").read_bytes()
 
 
@@ -225,15 +225,15 @@ def test_existing_figure_stays_without_overwrite(tmp_path: Path) -> None:
     path = tmp_path / "matches.png"
     path.write_text("mine")
     with pytest.raises(OutputExistsError):
-        draw(path)
+        draw_sample(path)
     assert path.read_text() == "mine"
-    draw(path, overwrite=True)
+    draw_sample(path, overwrite=True)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_unknown_extension_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"Use one of: \.png, \.svg, \.pdf"):
-        draw(tmp_path / "matches.bmp")
+        draw_sample(tmp_path / "matches.bmp")
     assert not list(tmp_path.iterdir())
 
 
@@ -242,19 +242,18 @@ def test_missing_matplotlib_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r"pip install '\.\[report\]'"):
-        draw(tmp_path / "matches.png")
+        draw_sample(tmp_path / "matches.png")
 
 
 def test_drawing_leaves_no_global_state(tmp_path: Path) -> None:
     code = """
 import sys
 import matplotlib
-from pathlib import Path
-from tests.unit.test_figures import draw
+from tests.unit.test_figures import draw_sample
 
 names = [name for name in matplotlib.rcParams if name != "backend"]
 before = [matplotlib.rcParams[name] for name in names]
-draw(Path(sys.argv[1]))
+draw_sample(sys.argv[1])
 assert [matplotlib.rcParams[name] for name in names] == before
 assert "matplotlib.pyplot" not in sys.modules
 """
