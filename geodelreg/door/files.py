@@ -199,6 +199,7 @@ class Inspection:
             suffix = name[len(file.name) :].lower()
             side = _folder(file) / name
             if suffix == _PAM:
+                check_regular(side)
                 data = side.read_bytes()
                 if b"overview" in data.lower() or b"&#" in data:
                     self._check(side, mentions.in_pam(side, data), parents)

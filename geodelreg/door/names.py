@@ -58,6 +58,15 @@ def is_there(name: str) -> bool:
     return os.path.exists(name)  # noqa: PTH110 - that of Path raises for names that are too long
 
 
+def is_encodable(name: str) -> bool:
+    """Whether GDAL can be given a name: rasterio passes names on as UTF-8."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def is_special(name: str) -> bool:
     """Whether GDAL takes a name for a URL, a ``/vsi…`` path or a subdataset, by its looks."""
     return name.startswith("/vsi") or "://" in name or re.match(r"[^/\\:]{2,}:", name) is not None

@@ -20,12 +20,13 @@ from geodelreg.door.names import (
     Subdataset,
     check_name,
     gdal_name,
+    is_encodable,
     is_local,
     is_there,
     needed_access,
     subdataset_of,
 )
-from geodelreg.errors import RasterNotFoundError
+from geodelreg.errors import RasterNotFoundError, RasterUnreadableError
 
 if TYPE_CHECKING:
     from zipfile import Path as ZipPath
@@ -146,12 +147,18 @@ def open_entry(entry: Entry, **options: Any) -> DatasetReader:
 
     Raises
     ------
+    RasterUnreadableError
+        Its name is none that GDAL can be given.
     rasterio.errors.RasterioIOError
     """
     import rasterio
     from rasterio.env import hasenv
     from rasterio.io import DatasetReader
 
+    if not is_encodable(entry.name):
+        raise RasterUnreadableError(
+            f"{entry.name} cannot be opened by GDAL: its name is not UTF-8", "Rename the file."
+        )
     if entry.drivers is not None:
         options["driver"] = list(entry.drivers)
     if entry.with_side_files:

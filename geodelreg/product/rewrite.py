@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from geodelreg.door.formats import FORMATS, needed_for
-from geodelreg.door.names import LOCAL, refuse
+from geodelreg.door.names import LOCAL, is_encodable, refuse
 from geodelreg.door.opening import allowed, open_raster
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, UsageError
 from geodelreg.masking import flag_bands
@@ -41,6 +41,8 @@ def output_driver(target: Path, driver: str | None) -> str:
     ------
     UsageError
         It is unknown.
+    OutputUnwritableError
+        GDAL cannot be given the name.
     LossyOutputError
         It makes many rasters of one.
     AccessNotAllowedError
@@ -49,6 +51,10 @@ def output_driver(target: Path, driver: str | None) -> str:
     import rasterio
     from rasterio.drivers import raster_driver_extensions
 
+    if not is_encodable(str(target)):
+        raise OutputUnwritableError(
+            f"{target} cannot be written by GDAL: its name is not UTF-8", "Choose another name."
+        )
     if driver is None:
         extension = target.suffix.lstrip(".").lower()
         by_extension: dict[str, str] = {"": "GTiff", **raster_driver_extensions()}

@@ -63,6 +63,26 @@ def test_a_record_of_edits_that_is_a_pipe_is_refused_at_once(
     assert "no regular file" in done.stderr
 
 
+def test_pam_that_is_a_pipe_is_refused_at_once(geodelreg: Command, pair: Path) -> None:
+    os.mkfifo(pair / "ms.tif.aux.xml")
+    done = geodelreg("align", "ms.tif", "pan.tif", "-o", "out.tif", cwd=pair)
+    assert done.returncode == 1
+    assert "ms.tif.aux.xml is a device or a pipe" in done.stderr
+
+
+@pytest.mark.parametrize("option", [(), ("--of", "PNG"), ("--warp",)], ids=["copy", "anew", "warp"])
+def test_rasters_with_a_name_that_gdal_cannot_be_given_are_refused(
+    geodelreg: Command, pair: Path, option: tuple[str, ...]
+) -> None:
+    done = geodelreg(
+        "align", "ms.tif", "pan.tif", "-o", os.fsdecode(b"x\xff.tif"), *option, cwd=pair
+    )
+    assert done.returncode == 1
+    assert "its name is not UTF-8" in done.stderr
+    assert "internal error" not in done.stderr
+    assert sorted(kinds(pair)) == ["ms.tif", "pan.tif"]
+
+
 def kinds(folder: Path) -> dict[str, int]:
     return {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()}
 

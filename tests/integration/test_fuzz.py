@@ -35,7 +35,7 @@ CORPUS = sorted((Path(__file__).parents[1] / "data" / "fuzz").glob("*.*"))
 RASTERS = [path for path in CORPUS if path.suffix in (".tif", ".vrt", ".png")]
 POINTS = [path for path in CORPUS if path not in RASTERS]
 
-HOSTILE_COUNT = 6
+HOSTILE_COUNT = 100
 HOSTILE = list(filter(is_hostile, range(100_031, 101_000)))[:HOSTILE_COUNT]
 
 needs_proc = pytest.mark.skipif(

@@ -57,6 +57,12 @@ def test_a_write_elsewhere_is_seen(tmp_path: Path, code: str, aim: str) -> None:
 
 
 @needs_strace
+def test_names_of_any_bytes_are_seen(tmp_path: Path) -> None:
+    facts = facts_of(tmp_path, "import os; open(b'../x\\xff\\xc3\\xa9', 'w')")
+    assert any(name.endswith("x\udcff\u00e9") for name in facts.written)
+
+
+@needs_strace
 def test_what_is_allowed_is_no_fact(tmp_path: Path) -> None:
     code = "import os; open('a', 'w'); os.rename('a', 'b'); os.unlink('b'); open(os.devnull, 'w')"
     facts = facts_of(tmp_path, code)
