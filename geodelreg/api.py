@@ -32,8 +32,8 @@ from geodelreg.values.result import (
     Misalignment,
     Outcome,
     Solution,
+    Timings,
 )
-from geodelreg.values.timings import Timings
 
 AnyPath = str | PathLike[str]
 MAX_LIMIT_PX = 1e6

@@ -46,9 +46,8 @@ from geodelreg.paper.zhang2013 import (
     reject_duplicates,
     reject_unshared,
 )
-from geodelreg.values.guess import Overview
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Keypoints, Status
+from geodelreg.values.points import Keypoints, Overview, Status
 from geodelreg.values.raster import Band, BoolArray, FloatArray, WindowReader
 
 LOOSE_PX = 8.0

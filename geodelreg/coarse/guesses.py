@@ -26,8 +26,7 @@ from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.pair import Pair, roles
-from geodelreg.values.guess import Guess, Overview, Scope
-from geodelreg.values.points import Keypoints, Matches, Status
+from geodelreg.values.points import Guess, Keypoints, Matches, Overview, Scope, Status
 from geodelreg.values.raster import Band, BoolArray, Grid
 
 logger = logging.getLogger(__name__)

@@ -18,8 +18,7 @@ from geodelreg.geo.affine import affine_from_matrix, affine_matrix, apply_affine
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.pair import Pair, overlap_corners, roles
 from geodelreg.paper.zhang2013 import ZhangOptions, match_sift, match_zhang2013
-from geodelreg.values.guess import Guess, Overview
-from geodelreg.values.points import TiePoints
+from geodelreg.values.points import Guess, Overview, TiePoints
 from geodelreg.values.raster import TINY
 
 _SIFT_SCATTER_PX = 0.3
