@@ -23,11 +23,9 @@ from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, verdic
 from geodelreg.judge.words import warnings_of
 from geodelreg.options import AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
-from geodelreg.values.guess import Guess
-from geodelreg.values.points import NO_TIE_POINTS, Status
+from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
 from geodelreg.values.raster import WindowReader
-from geodelreg.values.result import Accuracy, Solution
-from geodelreg.values.timings import Timings
+from geodelreg.values.result import Accuracy, Solution, Timings
 
 _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
 _FEWEST_POINTS = 4

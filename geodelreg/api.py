@@ -22,8 +22,7 @@ from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
-from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution
-from geodelreg.values.timings import Timings
+from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution, Timings
 from geodelreg.writing import AnyPath, paths_of
 
 MAX_LIMIT_PX = 1e6

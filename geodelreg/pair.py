@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geodelreg.errors import CrsTransformError, UnsupportedGeoreferenceError
-from geodelreg.geo.grid import gsd_px_m
+from geodelreg.geo.grid import corners_of, gsd_px_m, outline, window_around
 from geodelreg.geo.maps.header import HeaderMap, header_map
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.options import AlignOptions
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import FloatArray, Grid, Window, WindowReader
-from geodelreg.values.timings import Timings
+from geodelreg.values.raster import FloatArray, Window, WindowReader
+from geodelreg.values.result import Timings
 
 MOST_BANDS = 12
 """Bands of a hyperspectral image that are matched on at most."""
@@ -226,19 +226,6 @@ def roles(pair: Pair) -> Roles:
     return Roles(pair, pair.reference, pair.source, pan, pair.source_bands)
 
 
-def outline(grid: Grid, per_edge: int) -> FloatArray:
-    """(4 n, 2) pixels along the four edges of a raster, once around."""
-    height, width = grid.shape
-    t = np.linspace(0.0, 1.0, per_edge + 1)[:-1]
-    edges = [
-        np.stack([t * width, 0 * t], 1),
-        np.stack([0 * t + width, t * height], 1),
-        np.stack([(1 - t) * width, 0 * t + height], 1),
-        np.stack([0 * t, (1 - t) * height], 1),
-    ]
-    return np.concatenate(edges)
-
-
 def overlap_in_template(part: Roles, correction: PixelMap) -> Window | None:
     """Bounding window, in the template, of what the surface raster covers under a correction."""
     points = part.to_surface(correction).inverse(outline(part.surface.grid, _EDGE_PLACES))
@@ -255,22 +242,6 @@ def overlap_corners(part: Roles, correction: PixelMap) -> FloatArray:
         return part.pair.source_lattice(2)
     corners = corners_of(region)
     return corners if part.ms_is_template else part.to_surface(correction).forward(corners)
-
-
-def corners_of(window: Window) -> FloatArray:
-    """(4, 2) pixels at the corners of a window, row by row."""
-    x = np.array([window.column, window.column + window.width], dtype=np.float64)
-    y = np.array([window.row, window.row + window.height], dtype=np.float64)
-    return np.array([[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]])
-
-
-def window_around(points: FloatArray, margin_px: float, grid: Grid) -> Window | None:
-    """Whole pixels of a raster around (N, 2) points and a margin; None when there are none."""
-    size = grid.shape[::-1]
-    low, high = points.min(axis=0) - margin_px, points.max(axis=0) + margin_px
-    x0, y0 = (int(v) for v in np.floor(np.clip(low, 0, size)))
-    x1, y1 = (int(v) for v in np.ceil(np.clip(high, 0, size)))
-    return Window(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None
 
 
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from geodelreg.door.names import as_path
 from geodelreg.errors import UsageError
-from geodelreg.fine.band_weights import robust_band_weights
+from geodelreg.fine.tone import robust_band_weights
 from geodelreg.image.reader import check_band, open_raster
 from geodelreg.options import PansharpenOptions, check_header_holds
 from geodelreg.pair import Progress

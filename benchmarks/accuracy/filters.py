@@ -21,11 +21,13 @@ import cv2
 import numpy as np
 
 from benchmarks.report import machine, replace_section
+from geodelreg.fit.consensus import consensus_affine
 from geodelreg.fit.delaunay_mesh import filter_matches, star_filter
 from geodelreg.paper.zhang2013 import initial_status, reject_unshared
 from geodelreg.values.points import Status
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
+LOOSE_PX = 8.0  # tolerance of the consensus: noise and distortion together
 SIZE_PX = 1000.0
 PRECISION, RECALL = 0.99, 0.97
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -74,7 +76,8 @@ def draw_matches(case: Case, seed: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 def by_delaunay(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> BoolArray:
     """Loose global consensus, then the Delaunay mesh: geodelreg's default."""
-    return np.asarray(filter_matches(source, reference, ratio).status == Status.KEPT)
+    found = consensus_affine(source, reference, ratio, LOOSE_PX)
+    return np.asarray(filter_matches(source, reference, found) == Status.KEPT)
 
 
 def by_star(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> BoolArray:

@@ -23,6 +23,7 @@ from geodelreg.fine.passes import COARSE_SIGMA
 from geodelreg.fine.surface import make_surface
 from geodelreg.fine.tiles import overview_tile
 from geodelreg.fine.tuning import surface_sigma
+from geodelreg.fit.consensus import consensus_affine
 from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.fit.estimate import Observations, minimum_points
 from geodelreg.fit.models import Frame
@@ -43,11 +44,12 @@ from geodelreg.paper.zhang2013 import (
     reject_duplicates,
     reject_unshared,
 )
-from geodelreg.values.guess import Overview
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Status
+from geodelreg.values.points import Overview, Status
 from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
 
+LOOSE_PX = 8.0
+"""Tolerance of the consensus before the mesh: noise and distortion together."""
 RIGHT_PX = 1.0
 """A match is right within this many coarser pixels of the truth: three standard deviations of a
 SIFT position, and less than a cloud's parallax in the scenes."""
@@ -226,9 +228,10 @@ def run_mesh(matched: Matched) -> tuple[BoolArray, dict[str, int]]:
     """Step 3, then geodelreg's mismatch filter in the place of the paper's steps 4 to 6."""
     status, counts = run_steps(matched, ["3 one-to-one"])
     kept = np.flatnonzero(status == Status.KEPT)
-    mesh = filter_matches(matched.source_xy[kept], matched.reference_xy[kept], matched.ratio[kept])
+    points = matched.source_xy[kept], matched.reference_xy[kept]
+    mesh = filter_matches(*points, consensus_affine(*points, matched.ratio[kept], LOOSE_PX))
     chosen = np.zeros(len(status), dtype=np.bool_)
-    chosen[kept[mesh.status == Status.KEPT]] = True
+    chosen[kept[mesh == Status.KEPT]] = True
     return chosen, counts | {"our filter": int(chosen.sum())}
 
 

@@ -22,12 +22,11 @@ from geodelreg.fine.overlay import overlay
 from geodelreg.fine.surface import make_surface
 from geodelreg.fit.chance import log_nfa
 from geodelreg.fit.consensus import Consensus, consensus_keypoints, fit_plainly, radial_residuals
-from geodelreg.fit.delaunay_mesh import FilterOptions, filter_matches
+from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.pair import Pair, roles
-from geodelreg.values.guess import Guess, Overview, Scope
-from geodelreg.values.points import Keypoints, Matches, Status
+from geodelreg.values.points import Guess, Keypoints, Matches, Overview, Scope, Status
 from geodelreg.values.raster import Band, BoolArray, Grid
 
 logger = logging.getLogger(__name__)
@@ -241,14 +240,8 @@ def _agree(
     if similar.map is None:
         return None
     loose = radial_residuals(similar.map, source_xy, reference_xy) <= _LOOSE_PX
-    mesh = filter_matches(
-        source_xy,
-        reference_xy,
-        matches.ratio,
-        FilterOptions(consensus_px=_LOOSE_PX, seed=seed),
-        Consensus(similar.map, loose),
-    )
-    inliers = mesh.status == Status.KEPT
+    mesh = filter_matches(source_xy, reference_xy, Consensus(similar.map, loose))
+    inliers = mesh == Status.KEPT
     counts = counts | {"consensus": int(loose.sum()), "Delaunay mesh": int(inliers.sum())}
     if inliers.sum() < _FEWEST_MATCHES:
         return None

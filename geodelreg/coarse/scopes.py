@@ -9,7 +9,7 @@ import numpy as np
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.pair import Pair
-from geodelreg.values.guess import Overview, Scope
+from geodelreg.values.points import Overview, Scope
 from geodelreg.values.raster import Window
 
 _FIRST_BUDGET_PX = 250_000  # 500²; unexplained: ablate

@@ -22,9 +22,8 @@ from geodelreg.fit.models import Frame
 from geodelreg.fit.rigid_core import rigid_core
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.pair import LATTICE, Pair
-from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.points import Guess, Status, TiePoints
 from geodelreg.values.raster import Band, BoolArray, FloatArray, StatusArray
 
 ELSEWHERE = (Status.CONSENSUS, Status.STAR, Status.RESIDUAL)

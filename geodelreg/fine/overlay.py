@@ -9,8 +9,9 @@ from affine import Affine
 
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.grid import outline
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.pair import Roles, outline
+from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid
 

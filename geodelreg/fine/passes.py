@@ -11,7 +11,6 @@ from geodelreg.fine.layers import Pass, ground_alone, is_telling, same_place
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.looks import HAZE, PLAIN, SHARPER, Look, preference, sharpest
 from geodelreg.fine.matching import match_pass
-from geodelreg.fine.sharpness import fit_sigma
 from geodelreg.fine.tiles import (
     Tile,
     dark_tile,
@@ -21,12 +20,12 @@ from geodelreg.fine.tiles import (
     plan_tiles,
     read_tiles,
 )
-from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_tone
+from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_sigma, fit_tone
 from geodelreg.fit.estimate import Estimate
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Roles, overlap_in_template
-from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Guess
 
 COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
@@ -39,7 +38,7 @@ _FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
 _NEAR_HEADER_PX = 4.0
 _COARSE_FROM = 1.5  # times coarser than full resolution; unexplained: ablate
 _MUCH_VISIBLE = 0.75  # unexplained: ablate
-_BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.sharpness` that is not usual
+_BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.tuning` that is not usual
 
 
 @dataclass(frozen=True, slots=True, eq=False)

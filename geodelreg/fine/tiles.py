@@ -9,10 +9,11 @@ from threading import Lock
 import numpy as np
 
 from geodelreg.fine.surface import SPLINE_REACH_PX, Surface, make_surface
+from geodelreg.geo.grid import corners_of, window_around
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.pair import Roles, corners_of, window_around
-from geodelreg.values.guess import Guess, Overview
+from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Guess, Overview
 from geodelreg.values.raster import Band, BoolArray, Grid, Window
 
 PATCH_PX = 20  # square; unexplained: ablate

@@ -141,7 +141,8 @@ def consensus_keypoints(
     pool_source, pool_reference = pool.xy(source, reference)
     first, second = _agreeing_pairs(source, reference, pool)
     pair = np.stack([first, second], axis=1)
-    hypotheses = _through_two(pool_source[pair], pool_reference[pair])
+    exact = np.ones(pair.shape)
+    hypotheses = _fitted(pool_source[pair], pool_reference[pair], exact, "similarity")
     hypotheses = hypotheses[_plausible(hypotheses)]
     if len(hypotheses) == 0:
         return sampled
@@ -168,7 +169,7 @@ def fit_plainly(source_xy: FloatArray, reference_xy: FloatArray, kind: str) -> A
     kind : str
         ``similarity`` or ``affine``.
     """
-    every = np.ones((1, len(source_xy)), dtype=np.bool_)
+    every = np.ones((1, len(source_xy)))
     return AffineMap.of(_fitted(source_xy, reference_xy, every, kind)[0])
 
 
@@ -190,44 +191,8 @@ def _sampled_hypotheses(
     ordered = np.sort(index, axis=1)
     index = index[(np.diff(ordered, axis=1) > 0).all(axis=1)]
     s, r = source[index], reference[index]
-    matrices = _through_two(s, r) if size == 2 else _through_three(s, r)
+    matrices = _fitted(s, r, np.ones(index.shape), "similarity" if size == 2 else "affine")
     return matrices[_plausible(matrices)]
-
-
-def _through_two(source: FloatArray, reference: FloatArray) -> FloatArray:
-    """(S, 2, 3) similarities through (S, 2, 2) point pairs."""
-    s, r = source[:, 1] - source[:, 0], reference[:, 1] - reference[:, 0]
-    power = (s * s).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = (s * r).sum(axis=1) / power
-        across = (s[:, 0] * r[:, 1] - s[:, 1] * r[:, 0]) / power
-        return _similarities(along, across, source[:, 0], reference[:, 0])
-
-
-def _through_three(source: FloatArray, reference: FloatArray) -> FloatArray:
-    """(S, 2, 3) affines through (S, 3, 2) point triples."""
-    s, r = source[:, 1:] - source[:, :1], reference[:, 1:] - reference[:, :1]
-    determinant = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] * s[:, 1, 0]
-    adjugate = np.stack(
-        [np.stack([s[:, 1, 1], -s[:, 0, 1]], 1), np.stack([-s[:, 1, 0], s[:, 0, 0]], 1)], 1
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        transposed = (adjugate @ r) / determinant[:, None, None]
-        linear = transposed.transpose(0, 2, 1)
-        offset = reference[:, 0] - np.einsum("sij,sj->si", linear, source[:, 0])
-    return np.concatenate([linear, offset[:, :, None]], axis=2)
-
-
-def _similarities(
-    along: FloatArray, across: FloatArray, source: FloatArray, reference: FloatArray
-) -> FloatArray:
-    """(S, 2, 3) similarities of given linear part that take each source to its reference point."""
-    matrices = np.empty((len(along), 2, 3))
-    matrices[:, 0, 0] = matrices[:, 1, 1] = along
-    matrices[:, 1, 0], matrices[:, 0, 1] = across, -across
-    turned = np.einsum("sij,sj->si", matrices[:, :, :2], source)
-    matrices[:, :, 2] = reference - turned
-    return matrices
 
 
 def _agreeing_pairs(
@@ -326,7 +291,7 @@ def _refined(
         growing, near = growing[enough], near[enough]
         if not len(growing):
             break
-        matrices[growing] = _fitted(source_xy, reference_xy, near, kind)
+        matrices[growing] = _fitted(source_xy, reference_xy, near.astype(np.float64), kind)
     matrices = matrices[_plausible(matrices)]
     if not len(matrices):
         return _nothing(len(source_xy))
@@ -335,23 +300,28 @@ def _refined(
     return Consensus(best, radial_residuals(best, source_xy, reference_xy) <= threshold_px)
 
 
-def _fitted(source: FloatArray, reference: FloatArray, near: BoolArray, kind: str) -> FloatArray:
-    """(S, 2, 3) `fit_plainly` of the points that are near each of S hypotheses, (S, M)."""
-    weight = near.astype(np.float64)
+def _fitted(source: FloatArray, reference: FloatArray, weight: FloatArray, kind: str) -> FloatArray:
+    """(S, 2, 3) weighted `fit_plainly` of (S, M, 2) points, or of (M, 2) that all S share.
+
+    einsum throughout, for BLAS may round differently from one thread count to another.
+    """
     total = weight.sum(axis=1)[:, None]
-    # einsum throughout, for BLAS may round differently from one thread count to another
-    source_mean, reference_mean = (
-        np.einsum("sm,mk->sk", weight, xy) / total for xy in (source, reference)
-    )
-    s, r = source - source_mean[:, None], reference - reference_mean[:, None]
-    s *= weight[:, :, None]
+
+    def centred(xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        every = np.broadcast_to(xy, (*weight.shape, 2))
+        mean = np.einsum("sm,smk->sk", weight, every) / total
+        return every - mean[:, None], mean
+
+    (s, source_mean), (r, reference_mean) = centred(source), centred(reference)
+    s = s * weight[:, :, None]
     across = np.einsum("smi,smj->sij", s, r)
     normal = np.einsum("smi,smj->sij", s, s)
     if kind == "similarity":
         power = np.maximum(normal[:, 0, 0] + normal[:, 1, 1], np.finfo(np.float64).tiny)
         along = (across[:, 0, 0] + across[:, 1, 1]) / power
         turn = (across[:, 0, 1] - across[:, 1, 0]) / power
-        return _similarities(along, turn, source_mean, reference_mean)
-    linear = np.matmul(np.linalg.pinv(normal, hermitian=True), across).transpose(0, 2, 1)
+        linear = np.stack([np.stack([along, -turn], 1), np.stack([turn, along], 1)], 1)
+    else:
+        linear = np.matmul(np.linalg.pinv(normal, hermitian=True), across).transpose(0, 2, 1)
     offset = reference_mean - np.einsum("sij,sj->si", linear, source_mean)
     return np.concatenate([linear, offset[:, :, None]], axis=2)

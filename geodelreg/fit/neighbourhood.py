@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodelreg.geo.triangulation import distinct, neighbours
+from geodelreg.geo.triangulation import Star, running
 from geodelreg.values.raster import TINY, FloatArray, IntArray
 
-_FEW_POINTS = 12  # unexplained: ablate
 _FIT_ROUNDS = 2
 _CAUCHY_TUNING = 2.0
 _NEARNESS = 3.0
@@ -42,18 +41,6 @@ class Field(NamedTuple):
         return Field(self.xy[index], self.displacement[index], self.variance[index])
 
 
-class Star(NamedTuple):
-    """Pairs of a target and a point of the field near it, in order of the targets.
-
-    Attributes
-    ----------
-    target, member : (K,) intp
-    """
-
-    target: IntArray
-    member: IntArray
-
-
 class Prediction(NamedTuple):
     """Displacement that the star tells for each target.
 
@@ -71,56 +58,6 @@ class Prediction(NamedTuple):
     displacement: FloatArray
     variance: FloatArray
     scatter: FloatArray
-
-
-def own_stars(triangles: IntArray, count: int) -> Star:
-    """Star of every point of a mesh, without the point itself.
-
-    Parameters
-    ----------
-    triangles : (T, 3) intp
-    count : int
-        Number of points.  A dozen or fewer are all in each other's star, as are points without
-        any triangle.
-    """
-    if count <= _FEW_POINTS or len(triangles) == 0:
-        target, member = np.nonzero(~np.eye(count, dtype=np.bool_))
-        return Star(target, member)
-    near = neighbours(triangles, count)
-    owner = near.owner
-    reach = np.diff(near.start)[near.near]
-    through = np.repeat(near.start[near.near], reach) + _running(reach)
-    second = np.repeat(owner, reach) * count + near.near[through]
-    keys = distinct(np.concatenate([owner * count + near.near, second]))
-    target, member = np.divmod(keys, count)
-    other = target != member
-    return Star(target[other], member[other])
-
-
-def stars_of(targets: FloatArray, xy: FloatArray, own: Star) -> Star:
-    """For each target, the nearest point of the mesh and that point's star.
-
-    Parameters
-    ----------
-    targets : (T, 2) float64
-    xy : (N, 2) float64
-        At least one point.
-    own : Star
-        `own_stars` of these points.
-    """
-    from shapely import STRtree, points
-
-    nearest = STRtree(np.asarray(points(xy))).nearest(np.asarray(points(targets)))
-    start = np.searchsorted(own.target, np.arange(len(xy) + 1))
-    size = np.diff(start)[nearest]
-    target = np.repeat(np.arange(len(targets)), size + 1)
-    member = np.empty(len(target), dtype=np.intp)
-    first = np.cumsum(size + 1) - size - 1
-    member[first] = nearest
-    rest = np.ones(len(target), dtype=np.bool_)
-    rest[first] = False
-    member[rest] = own.member[np.repeat(start[nearest], size) + _running(size)]
-    return Star(target, member)
 
 
 def predict(targets: FloatArray, star: Star, field: Field, max_strain: float) -> Prediction:
@@ -181,15 +118,12 @@ def _fit_planes(
 ) -> tuple[FloatArray, FloatArray]:
     """(T, 3, 2) plane coefficients and (T,) variance of the constant term."""
     count = len(prior)
-    normal = np.zeros((count, 3, 3))
-    right = np.zeros((count, 3, 2))
-    for i in range(3):
-        weighted = weight * basis[:, i]
-        for j in range(i, 3):
-            normal[:, i, j] = np.bincount(target, weighted * basis[:, j], count)
-            normal[:, j, i] = normal[:, i, j]
-        for c in range(2):
-            right[:, i, c] = np.bincount(target, weighted * values[:, c], count)
+    normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3, 2))
+    weighted = weight[:, None] * basis
+    for i, j in np.ndindex(3, 3):
+        normal[:, i, j] = np.bincount(target, weighted[:, i] * basis[:, j], count)
+    for i, c in np.ndindex(3, 2):
+        right[:, i, c] = np.bincount(target, weighted[:, i] * values[:, c], count)
     starless = normal[:, 0, 0] == 0
     normal[starless, 0, 0] = 1.0
     normal[:, 1, 1] += prior
@@ -206,11 +140,6 @@ def _medians(target: IntArray, values: FloatArray, count: int) -> FloatArray:
     some = np.flatnonzero(size)
     padded = np.full((count, int(size.max(initial=0))), np.inf)
     for c in range(2):
-        padded[target, _running(size)] = values[:, c]
+        padded[target, running(size)] = values[:, c]
         medians[some, c] = np.sort(padded, axis=1)[some, (size[some] - 1) // 2]
     return medians
-
-
-def _running(sizes: IntArray) -> IntArray:
-    """0, 1, ... for each of consecutive groups of the given sizes."""
-    return np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)

@@ -10,7 +10,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.errors import CrsTransformError
-from geodelreg.values.raster import Grid, Window
+from geodelreg.values.raster import FloatArray, Grid, Window
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -104,3 +104,32 @@ def _crs(wkt: str) -> CRS:
 
 def _unit_m(crs: CRS) -> float:
     return float(crs.axis_info[0].unit_conversion_factor) if crs.axis_info else 1.0
+
+
+def outline(grid: Grid, per_edge: int) -> FloatArray:
+    """(4 n, 2) pixels along the four edges of a raster, once around."""
+    height, width = grid.shape
+    t = np.linspace(0.0, 1.0, per_edge + 1)[:-1]
+    edges = [
+        np.stack([t * width, 0 * t], 1),
+        np.stack([0 * t + width, t * height], 1),
+        np.stack([(1 - t) * width, 0 * t + height], 1),
+        np.stack([0 * t, (1 - t) * height], 1),
+    ]
+    return np.concatenate(edges)
+
+
+def corners_of(window: Window) -> FloatArray:
+    """(4, 2) pixels at the corners of a window, row by row."""
+    x = np.array([window.column, window.column + window.width], dtype=np.float64)
+    y = np.array([window.row, window.row + window.height], dtype=np.float64)
+    return np.array([[x[0], y[0]], [x[1], y[0]], [x[0], y[1]], [x[1], y[1]]])
+
+
+def window_around(points: FloatArray, margin_px: float, grid: Grid) -> Window | None:
+    """Whole pixels of a raster around (N, 2) points and a margin; None when there are none."""
+    size = grid.shape[::-1]
+    low, high = points.min(axis=0) - margin_px, points.max(axis=0) + margin_px
+    x0, y0 = (int(v) for v in np.floor(np.clip(low, 0, size)))
+    x1, y1 = (int(v) for v in np.ceil(np.clip(high, 0, size)))
+    return Window(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from geodelreg.values.raster import FloatArray, IntArray
 
+_FEW_POINTS = 12  # unexplained: ablate
+
 
 class InteriorEdges(NamedTuple):
     """Edges between two triangles.
@@ -49,6 +51,18 @@ class Neighbours(NamedTuple):
     def owner(self) -> IntArray:
         """(K,) intp, the point that each entry of `near` is a neighbour of."""
         return np.repeat(np.arange(len(self.start) - 1, dtype=np.intp), np.diff(self.start))
+
+
+class Star(NamedTuple):
+    """Pairs of a target and a point of the field near it, in order of the targets.
+
+    Attributes
+    ----------
+    target, member : (K,) intp
+    """
+
+    target: IntArray
+    member: IntArray
 
 
 def delaunay(xy: FloatArray) -> IntArray:
@@ -142,6 +156,61 @@ def neighbours(triangles: IntArray, count: int) -> Neighbours:
     owner, near = np.divmod(both, max(count, 1))
     start = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
     return Neighbours(start.astype(np.intp), near)
+
+
+def own_stars(triangles: IntArray, count: int) -> Star:
+    """Star of every point of a mesh, without the point itself.
+
+    Parameters
+    ----------
+    triangles : (T, 3) intp
+    count : int
+        Number of points.  A dozen or fewer are all in each other's star, as are points without
+        any triangle.
+    """
+    if count <= _FEW_POINTS or len(triangles) == 0:
+        target, member = np.nonzero(~np.eye(count, dtype=np.bool_))
+        return Star(target, member)
+    near = neighbours(triangles, count)
+    owner = near.owner
+    reach = np.diff(near.start)[near.near]
+    through = np.repeat(near.start[near.near], reach) + running(reach)
+    second = np.repeat(owner, reach) * count + near.near[through]
+    keys = distinct(np.concatenate([owner * count + near.near, second]))
+    target, member = np.divmod(keys, count)
+    other = target != member
+    return Star(target[other], member[other])
+
+
+def stars_of(targets: FloatArray, xy: FloatArray, own: Star) -> Star:
+    """For each target, the nearest point of the mesh and that point's star.
+
+    Parameters
+    ----------
+    targets : (T, 2) float64
+    xy : (N, 2) float64
+        At least one point.
+    own : Star
+        `own_stars` of these points.
+    """
+    from shapely import STRtree, points
+
+    nearest = STRtree(np.asarray(points(xy))).nearest(np.asarray(points(targets)))
+    start = np.searchsorted(own.target, np.arange(len(xy) + 1))
+    size = np.diff(start)[nearest]
+    target = np.repeat(np.arange(len(targets)), size + 1)
+    member = np.empty(len(target), dtype=np.intp)
+    first = np.cumsum(size + 1) - size - 1
+    member[first] = nearest
+    rest = np.ones(len(target), dtype=np.bool_)
+    rest[first] = False
+    member[rest] = own.member[np.repeat(start[nearest], size) + running(size)]
+    return Star(target, member)
+
+
+def running(sizes: IntArray) -> IntArray:
+    """0, 1, ... for each of consecutive groups of the given sizes."""
+    return np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
 
 
 def relative_altitude(xy: FloatArray, triangles: IntArray) -> FloatArray:

@@ -8,7 +8,8 @@ import numpy as np
 
 from geodelreg.fine.overlay import Overlay
 from geodelreg.fit.choice import HeldOut, Selection
-from geodelreg.pair import Pair, Roles, outline, overlap_corners
+from geodelreg.geo.grid import outline
+from geodelreg.pair import Pair, Roles, overlap_corners
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray

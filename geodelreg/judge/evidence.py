@@ -22,8 +22,8 @@ from geodelreg.judge.in_place import area_evidence
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair
-from geodelreg.values.guess import Guess
 from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Guess
 from geodelreg.values.raster import TINY
 from geodelreg.values.result import Accuracy
 

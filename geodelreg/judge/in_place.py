@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ _LEAST_DISPLACED = 8  # half of the places
 _RESEMBLES = MIN_CORRELATION**2  # share of the variance that is explained
 
 
-@dataclass(frozen=True, slots=True)
-class AreaEvidence:
+class AreaEvidence(NamedTuple):
     """How areas correlate where the correction puts them.
 
     Attributes
@@ -54,15 +53,6 @@ class AreaEvidence:
         """Share of the patches that resemble something that do so best in place; NaN of none."""
         return self.alike_in_place / self.alike if self.alike else float("nan")
 
-    def plus(self, other: AreaEvidence) -> AreaEvidence:
-        """Of both together."""
-        return AreaEvidence(
-            self.tested + other.tested,
-            self.best_in_place + other.best_in_place,
-            self.alike + other.alike,
-            self.alike_in_place + other.alike_in_place,
-        )
-
 
 def area_evidence(
     part: Roles, tiles: list[Tile], correction: PixelMap, tuning: Tuning, size: int, few: bool
@@ -82,14 +72,14 @@ def area_evidence(
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
     every = sample_step([tile.template[0] for tile in tiles], size, _TESTED_PATCHES) if few else 1
-    there, found = part.to_surface(correction), AreaEvidence()
+    there, counts = part.to_surface(correction), [AreaEvidence()]
     for number, tile in enumerate(tiles):
         bands, surface = tile_images(part, tile, tuning)
         patches = cut_patches(bands, part.template.grid, size)
         chosen = np.arange(number % every, len(patches), every)
         scores = _explained(there, surface, patches, chosen, offsets)
-        found = found.plus(best_in_place(scores))
-    return found
+        counts.append(best_in_place(scores))
+    return AreaEvidence(*map(sum, zip(*counts, strict=True)))
 
 
 def best_in_place(scores: FloatArray) -> AreaEvidence:

@@ -5,7 +5,7 @@ Every reason is a measured value against a stated limit; `geodelreg.judge.eviden
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -14,24 +14,29 @@ from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
 
 MIN_POINTS = 8  # unexplained: ablate
-MAX_LOG_EACH = -2.0
-MAX_LOG_TOGETHER = -8.0  # unexplained: ablate
-MAX_SIGMA_PX = 0.7  # unexplained: ablate
-MIN_COVERAGE = 0.05  # unexplained: ablate
-MAX_DISAGREEMENT_PX = 1.0
-MAX_RIVAL = 0.85  # unexplained: ablate
-MAX_RIVAL_MOTION = 0.67  # two thirds; unexplained: ablate
-MIN_SUPPORT = 0.5
-MAX_BANDS_APART = 0.5
-MAX_KEYPOINTS_APART = 2.0
+_MAX_LOG_EACH = -2.0  # one alarm in a hundred
+_LIMITS = (
+    ("tie_points", "≥", MIN_POINTS, "tie points agree"),
+    ("log_nfa", "≤", _MAX_LOG_EACH, "log10 of the expected chance agreements"),
+    ("log_chance", "≤", _MAX_LOG_EACH, "log10 of the chance that unrelated areas correlate so"),
+    ("log_together", "≤", -8.0, "log10 of the chance of both, positions and likeness"),
+    ("coverage", "≥", 0.05, "share of the overlap covered"),
+    ("sigma_px", "≤", 0.7, "PAN px standard error at the worst corner"),
+    ("disagreement_px", "≤", 1.0, "PAN px between the correction and"),
+    ("rival", "≤", 0.85, "relative correlation of the best rival place"),
+    ("rival_motion", "≤", 0.67, "patches agree on another motion for each that agrees on this one"),
+    ("support", "≥", 0.5, "share of the areas correlates best in place"),
+    ("bands_apart", "≤", 0.5, "coarser px between the places of two MS bands, as of clouds"),
+)
+"""Name of the evidence, what it must be, and the words for it; unexplained: ablate."""
+_LAST_LIMITS = (
+    ("keypoints_apart", "≤", 2.0, "coarser px from where keypoints, more certain, put the ground"),
+)
+"""After what the user asked; unexplained: ablate."""
+_APART_FROM = {True: "half of the tie points", False: "the patches around it"}
+"""What `disagreement_px` compares it with, in our method and in others."""
 SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
 SIGNIFICANCE = 3.0
-
-
-_APART_FROM = {
-    True: "PAN px between the corrections of two halves of the tie points",
-    False: "PAN px between the correction and the patches around it",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,67 +98,25 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     tuple of Reason
         The correction is believed when all passed.
     """
-    reasons = [
-        _at_least("tie_points", evidence.points, MIN_POINTS, "tie points agree"),
-        _at_most(
-            "log_nfa", evidence.log_nfa, MAX_LOG_EACH, "log10 of the expected chance agreements"
-        ),
-        _at_most(
-            "log_chance",
-            evidence.log_chance,
-            MAX_LOG_EACH,
-            "log10 of the chance that unrelated areas correlate so",
-        ),
-        _at_most(
-            "log_together",
-            evidence.log_nfa + evidence.log_chance,
-            MAX_LOG_TOGETHER,
-            "log10 of the chance of both, positions and likeness",
-        ),
-        _at_least("coverage", evidence.coverage, MIN_COVERAGE, "share of the overlap covered"),
-        _at_most(
-            "sigma_px", evidence.sigma_px, MAX_SIGMA_PX, "PAN px standard error at the worst corner"
-        ),
-        _at_most(
-            "disagreement_px",
-            evidence.disagreement_px,
-            MAX_DISAGREEMENT_PX,
-            _APART_FROM[options.method == "delaunay"],
-        ),
-        _at_most(
-            "rival", evidence.rival, MAX_RIVAL, "relative correlation of the best rival place"
-        ),
-        _at_most(
-            "rival_motion",
-            evidence.rival_motion,
-            MAX_RIVAL_MOTION,
-            "patches agree on another motion for each that agrees on this one",
-        ),
-        _at_least(
-            "support", evidence.support, MIN_SUPPORT, "share of the areas correlates best in place"
-        ),
-        _at_most(
-            "bands_apart",
-            evidence.bands_apart,
-            MAX_BANDS_APART,
-            "coarser px between the places of two MS bands, as of clouds",
-        ),
-    ]
-    if options.max_shift_px is not None:
-        reasons.append(
-            _at_most("max_shift", evidence.shift_px, options.max_shift_px, "PAN px shift")
-        )
-    if options.max_rotation_deg is not None:
-        reasons.append(
-            _at_most(
-                "max_rotation", evidence.rotation_deg, options.max_rotation_deg, "deg rotation"
-            )
-        )
-    if options.max_scale is not None:
-        reasons.append(_at_most("max_scale", evidence.scale, options.max_scale, "scale factor"))
-    what = "coarser px from where keypoints, with more certainty, put the ground"
-    apart = _at_most("keypoints_apart", evidence.keypoints_apart, MAX_KEYPOINTS_APART, what)
-    return (*reasons, apart)
+    asked = (
+        ("max_shift", "≤", options.max_shift_px, "PAN px shift"),
+        ("max_rotation", "≤", options.max_rotation_deg, "deg rotation"),
+        ("max_scale", "≤", options.max_scale, "scale factor"),
+    )
+    values = asdict(evidence) | {
+        "tie_points": evidence.points,
+        "log_together": evidence.log_nfa + evidence.log_chance,
+        "max_shift": evidence.shift_px,
+        "max_rotation": evidence.rotation_deg,
+        "max_scale": evidence.scale,
+    }
+    reasons = []
+    for name, relation, limit, what in (*_LIMITS, *asked, *_LAST_LIMITS):
+        if limit is not None:
+            apart_from = _APART_FROM[options.method == "delaunay"] if what.endswith("and") else ""
+            words = f"{what} {apart_from}".rstrip()
+            reasons.append(_reason(name, values[name], relation, limit, words))
+    return tuple(reasons)
 
 
 def nothing_agrees() -> Reason:
@@ -184,15 +147,7 @@ def is_worthwhile(move_px: FloatArray, sigma_px: FloatArray, tolerance_px: float
     return bool((move_px > tolerance_px).any() or (move_px > SIGNIFICANCE * noise).any())
 
 
-def _at_least(name: str, value: float, limit: float, what: str) -> Reason:
-    passed = bool(value >= limit)
-    return Reason(name, float(value), float(limit), passed, _sentence(value, limit, what, "≥"))
-
-
-def _at_most(name: str, value: float, limit: float, what: str) -> Reason:
-    passed = bool(value <= limit)
-    return Reason(name, float(value), float(limit), passed, _sentence(value, limit, what, "≤"))
-
-
-def _sentence(value: float, limit: float, what: str, relation: str) -> str:
-    return f"{value:.4g} {what} (needs {relation} {limit:g})"
+def _reason(name: str, value: float, relation: str, limit: float, what: str) -> Reason:
+    passed = value >= limit if relation == "≥" else value <= limit
+    message = f"{value:.4g} {what} (needs {relation} {limit:g})"
+    return Reason(name, float(value), float(limit), bool(passed), message)

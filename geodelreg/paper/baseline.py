@@ -27,8 +27,7 @@ from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.pair import Pair, overlap_corners, roles
 from geodelreg.paper.zhang2013 import ZhangOptions, lowe_options, match_sift, match_zhang2013
-from geodelreg.values.guess import Guess, Overview, Scope
-from geodelreg.values.points import Keypoints, TiePoints
+from geodelreg.values.points import Guess, Keypoints, Overview, Scope, TiePoints
 from geodelreg.values.raster import TINY, Band
 
 _GREY_BANDS = 3

@@ -29,8 +29,7 @@ from geodelreg.judge.in_place import AreaEvidence, area_evidence, best_in_place
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.options import AlignOptions
 from geodelreg.pair import make_pair, roles
-from geodelreg.values.guess import Guess, Overview
-from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.points import Guess, Overview, Status, TiePoints
 from geodelreg.values.raster import Band, Grid, Window
 
 SIDE = 140

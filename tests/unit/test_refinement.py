@@ -14,13 +14,13 @@ from geodelreg.fine.layers import Pass, agreement
 from geodelreg.fine.least_squares import Matched
 from geodelreg.fine.looks import preference
 from geodelreg.fine.passes import refine
-from geodelreg.fine.sharpness import lowest
+from geodelreg.fine.tuning import lowest
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.options import AlignOptions
 from geodelreg.pair import make_pair, roles
-from geodelreg.values.guess import Guess
+from geodelreg.values.points import Guess
 from geodelreg.values.raster import Band, Grid
 from tests.unit.test_gate_evidence import ArrayReader, texture
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodelreg.fit.neighbourhood import Field, own_stars, predict, stars_of
-from geodelreg.geo.triangulation import delaunay, edges
+from geodelreg.fit.neighbourhood import Field, predict
+from geodelreg.geo.triangulation import delaunay, edges, own_stars, stars_of
 from geodelreg.values.raster import FloatArray
 
 

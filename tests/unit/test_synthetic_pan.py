@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from geodelreg.fine.band_weights import non_negative_weights, robust_band_weights
-from geodelreg.fine.tone import SyntheticPan, fit_synthetic_pan, single_band
+from geodelreg.fine.tone import (
+    SyntheticPan,
+    fit_synthetic_pan,
+    non_negative_weights,
+    robust_band_weights,
+    single_band,
+)
 from geodelreg.values.raster import Band, Grid
 
 Array = NDArray[np.float64]
