@@ -24,7 +24,6 @@ from geodelreg.door.formats import skip_the_rest
 from geodelreg.door.names import ALL
 from geodelreg.errors import ClusterError, PairCrashedError, UsageError
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
-from geodelreg.product.atomic import exclusive
 from geodelreg.product.targets import check_replaceable
 
 AnyPath = str | PathLike[str]
@@ -191,6 +190,8 @@ class Batch:
         FileLockedError
             Another process runs this ledger.
         """
+        from geodelreg.product.atomic import exclusive
+
         with exclusive(self.path), Ledger(self.path) as ledger:
             ledger.retry(self._retry)
             self.counts = ledger.counts()
