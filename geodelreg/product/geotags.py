@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from affine import Affine
 
+from geodelreg.product.sidecars import DOMAIN
 from geodelreg.tiff import ASCII, DOUBLE, Directory, Entry, Layout, TiffFile
 from geodelreg.values.points import Gcp
 
@@ -22,9 +23,6 @@ GDAL_METADATA, RPC_COEFFICIENTS = 42112, 50844
 PLACEMENT = (PIXEL_SCALE, TIE_POINTS, TRANSFORMATION)
 CRS_TAGS = (GEO_KEYS, GEO_DOUBLES, GEO_TEXTS)
 _RASTER_TYPE_KEY, _PIXEL_IS_POINT = 1025, 2
-
-DOMAIN = "GEODELREG"
-"""Metadata domain of the GCPs; also the prefix of the provenance tags."""
 
 _ITEM = re.compile(
     rb"[ \t]*<Item\b([^>]*?)(?:/>|>(?:<!\[CDATA\[.*?\]\]>|(?!<!\[CDATA\[).)*?</Item>)[ \t]*\r?\n?",

@@ -54,7 +54,7 @@ class Provenance:
         """Metadata items by domain; "" is the default one."""
         domains: dict[str, Mapping[str, str]] = {"": self.tags}
         if self.gcps:
-            domains[geotags.DOMAIN] = {"GCPS": geotags.gcps_json(self.gcps)}
+            domains[sidecars.DOMAIN] = {"GCPS": geotags.gcps_json(self.gcps)}
         return domains
 
 

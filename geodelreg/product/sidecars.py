@@ -9,15 +9,18 @@ import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-from affine import Affine
-
-from geodelreg.geo.pixel import HALF_PIXEL
 from geodelreg.product.copying import copy_file
-from geodelreg.product.geotags import DOMAIN
+
+if TYPE_CHECKING:
+    from affine import Affine
 
 logger = logging.getLogger(__name__)
+
+DOMAIN = "GEODELREG"
+"""Metadata domain of the GCPs; also the prefix of the provenance tags."""
 
 PIXEL_SUFFIXES = (".ovr", ".msk", ".msk.ovr", ".ovr.msk")
 """Side files of pixels: valid beside any copy of the raster."""
@@ -131,6 +134,8 @@ def carry(source: Path, out: Path, strip_rpc: bool) -> list[str]:
 
 def world_file_text(transform: Affine) -> str:
     """World file of a geotransform: it gives the centre of the upper-left pixel."""
+    from geodelreg.geo.pixel import HALF_PIXEL
+
     x, y = transform @ (HALF_PIXEL, HALF_PIXEL)
     values = (transform.a, transform.d, transform.b, transform.e, x, y)
     return "".join(f"{value!r}\n" for value in map(float, values))
