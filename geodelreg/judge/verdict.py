@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.options import AlignOptions
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
@@ -67,6 +68,12 @@ class Evidence:
         standard errors.
     keypoints_apart : float
         Coarser pixels between the correction and what stronger, refused keypoint matches say.
+    residual_low_px : float
+        Lower end of the 95 % interval of what the correction leaves of the ground's smooth map.
+    moved : float
+        Share of the textured patches that agree on another motion than the ground's.
+    words : str
+        Where those lie.
     """
 
     points: int
@@ -83,6 +90,9 @@ class Evidence:
     support: float
     bands_apart: float
     keypoints_apart: float
+    residual_low_px: float = 0.0
+    moved: float = 0.0
+    words: str = ""
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -153,7 +163,23 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         reasons.append(_at_most("max_scale", evidence.scale, options.max_scale, "scale factor"))
     what = "coarser px from where keypoints, with more certainty, put the ground"
     apart = _at_most("keypoints_apart", evidence.keypoints_apart, MAX_KEYPOINTS_APART, what)
-    return (*reasons, apart)
+    whole = [
+        _at_most(
+            "two_motions", evidence.moved, LEAST_SHARE,
+            f"of the patches follow another motion than the ground's: {evidence.words}"
+            if evidence.moved
+            else "of the patches follow another motion than the ground's",
+        )
+    ]  # fmt: skip
+    if options.on_local == "refuse":
+        what = "PAN px RMS at least is left by one affine of the ground's bend"
+        whole.append(_at_most("local", evidence.residual_low_px, options.max_residual_px, what))
+    return (*reasons, apart, *whole)
+
+
+def passes(reasons: tuple[Reason, ...]) -> bool:
+    """True when nothing speaks against a correction."""
+    return all(reason.passed for reason in reasons)
 
 
 def nothing_agrees() -> Reason:
@@ -164,7 +190,7 @@ def nothing_agrees() -> Reason:
 
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:
     """Aligned or already aligned when every reason passed, else refused."""
-    if not all(reason.passed for reason in reasons):
+    if not passes(reasons):
         return Verdict(Outcome.REFUSED, reasons)
     return Verdict(Outcome.ALIGNED if moves else Outcome.ALREADY_ALIGNED, reasons)
 
