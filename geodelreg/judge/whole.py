@@ -200,7 +200,10 @@ def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
         for p in (last, first, second)
     )
     difference = one - other
-    difference -= np.nanmedian(difference, axis=0)
+    known = np.isfinite(difference).all(axis=1)
+    if not known.any():
+        return None
+    difference -= np.median(difference[known], axis=0)
     variance = first.points.covariance + second.points.covariance
     return height_parallax(move, difference, np.sqrt(variance.trace(axis1=1, axis2=2)))
 
