@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fine.clouds import CloudLook, cloud_look
-from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE, Motion, layers
+from geodelreg.fine.motions import (
+    LEAST_PATCHES,
+    LEAST_SHARE,
+    Motion,
+    is_solid,
+    layers,
+    second_motion,
+)
 from geodelreg.fit.consensus import consensus_affine
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
@@ -69,16 +76,22 @@ def find_ground(
 
 
 def other_motions(
+    source: FloatArray,
     move: FloatArray,
     label: IntArray,
     brightness: FloatArray,
     roughness: FloatArray,
     textured: int,
+    reach_px: float,
 ) -> list[Motion]:
     """Motions besides the ground's that so many patches share that no result may ignore them.
 
+    Strips one patch wide are no layer, for most of their neighbours are the ground's; they count
+    when they agree, and no other patches lie among them.
+
     Parameters
     ----------
+    source : (N, 2) float64
     move : (N, 2) float64
         Where patches were placed minus where the ground's map puts them, coarser pixels.
     label : (N,) intp
@@ -87,6 +100,8 @@ def other_motions(
         As for `find_ground`: one of two layers that is brighter and smoother is a bank of clouds.
     textured : int
         Number of all textured patches, placed or not.
+    reach_px : float
+        Of the search that placed them.
 
     Returns
     -------
@@ -103,4 +118,8 @@ def other_motions(
         both = member | (label == 0)
         if not cloud_look(member[both], brightness[both], roughness[both]).tells_layers_apart:
             found.append(Motion(member, centre))
+    strays = (label < 0) & (np.hypot(*move.T) > _ANOTHER_PX)
+    strip = second_motion(move, strays, _ANOTHER_PX, reach_px)
+    if strip is not None and strip.member.sum() >= least and is_solid(source, strip.member):
+        found.append(strip)
     return sorted(found, key=lambda motion: -int(motion.member.sum()))

@@ -17,6 +17,10 @@ MOST_STRAIN = 0.04
 """Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
 LEAST_SHARE = 0.05
 LEAST_PATCHES = 8
+_CHANCE = 1e-3
+"""Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
+_SOLID = 0.9
+_ROUNDING_PX = 1e-6
 _CORE = 0.75
 """Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
 those astride a tear fit to both sides a little, and to neither well."""
@@ -115,3 +119,57 @@ class Motion:
 
     member: BoolArray
     move: FloatArray
+
+
+def second_motion(
+    move: FloatArray, candidate: BoolArray, radius_px: float, reach_px: float
+) -> Motion | None:
+    """The largest group of patches that agree on one displacement, if chance makes no such group.
+
+    A contrario: a patch that shows nothing of the other image is placed anywhere within reach,
+    uniformly and by itself (Desolneux, Moisan & Morel 2008, chapter 3).
+
+    Parameters
+    ----------
+    move : (N, 2) float64
+        Displacement of the patches against the ground's map.
+    candidate : (N,) bool
+        Patches that the ground's map does not explain.
+    radius_px : float
+        Within which displacements agree.
+    reach_px : float
+        Radius of the search that found the displacements.
+
+    Returns
+    -------
+    Motion or None
+    """
+    from scipy.special import bdtrc
+
+    index = np.flatnonzero(candidate)
+    if len(index) < 2:
+        return None
+    gap = np.hypot(*(move[index][:, None] - move[index][None]).transpose(2, 0, 1))
+    near = gap <= radius_px
+    best = int(near.sum(axis=1).argmax())
+    centre = move[index][near[best]].mean(axis=0)
+    inside = np.hypot(*(move[index] - centre).T) <= radius_px
+    count, total = int(inside.sum()), len(index)
+    share = min((radius_px / reach_px) ** 2, 1.0)
+    # one of the members gave the place, so one less speaks for it
+    tail = float(bdtrc(count - 2, total - 1, share)) if count > 1 else 1.0
+    log_nfa = math.log10(total) + math.log10(max(tail, 1e-300))
+    if log_nfa > math.log10(_CHANCE):
+        return None
+    member = np.zeros(len(move), dtype=bool)
+    member[index[inside]] = True
+    return Motion(member, centre)
+
+
+def is_solid(xy: FloatArray, member: BoolArray) -> bool:
+    """True when hardly any other of (N, 2) patches lies among the members: they are one part."""
+    from shapely import MultiPoint, contains_xy
+
+    around = MultiPoint(xy[member]).convex_hull.buffer(_ROUNDING_PX)
+    inside = contains_xy(around, xy[:, 0], xy[:, 1])
+    return bool(member[inside].mean() >= _SOLID)

@@ -14,7 +14,7 @@ from geodelreg.fine.matching import match_pass, observe
 from geodelreg.fine.motions import layers
 from geodelreg.fine.overlay import overlay
 from geodelreg.fine.passes import Refinement
-from geodelreg.fine.survey import Places, survey
+from geodelreg.fine.survey import REACH_PX, Places, survey
 from geodelreg.fine.tone import single_band
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import FEWEST_POINTS, Field, fit_field
@@ -146,7 +146,7 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     places = survey(overlay(part, template, surface, correction))
     index = np.flatnonzero(_placed(places))
     if len(index) < FEWEST_POINTS:
-        return agreed
+        return _bent(refined, correction, agreed)
     at, move = places.centre[index], places.move[index]
     doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
     ground = find_ground(at, at + move, doubt, places.brightness[index], places.roughness[index])
@@ -223,7 +223,7 @@ def _other_motion(
     apart = move - np.median(move[ground.member], axis=0)
     textured = int(places.textured.sum())
     looks = places.brightness[index], places.roughness[index]
-    motions = other_motions(apart, ground.label, *looks, textured)
+    motions = other_motions(at, apart, ground.label, *looks, textured, REACH_PX)
     if not motions:
         return 0.0, ""
     motion = motions[0]
@@ -236,16 +236,19 @@ def _other_motion(
     )
 
 
-def _bent(refined: Refinement, correction: PixelMap, agreed: Whole, far: Observations) -> Whole:
+def _bent(
+    refined: Refinement, correction: PixelMap, agreed: Whole, far: Observations | None = None
+) -> Whole:
     """The ground's smooth map through patches of the last pass, and those out of its reach."""
     pair, last = refined.part.pair, refined.last
     matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
-    dense = last.points.take(matched)
-    points = Observations(
-        np.concatenate([dense.source, far.source]),
-        np.concatenate([dense.target, far.target]),
-        np.concatenate([dense.covariance, far.covariance]),
-    )
+    points = last.points.take(matched)
+    if far is not None:
+        points = Observations(
+            np.concatenate([points.source, far.source]),
+            np.concatenate([points.target, far.target]),
+            np.concatenate([points.covariance, far.covariance]),
+        )
     move = points.target - correction.forward(points.source)
     sigma = np.sqrt(points.covariance.trace(axis1=1, axis2=2))
     member = layers(points.source, move, sigma) == 0

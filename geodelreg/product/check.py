@@ -111,15 +111,13 @@ def explanation(
     if outcome is not CheckOutcome.CANNOT_TELL:
         return ""
     failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
-    if not failed and high > limit_px:
-        return (
-            f"one affine leaves up to {short(high)} PAN px RMS of local distortion, which leaves "
-            f"open whether that is within a tolerance of {limit_px:g} PAN px"
+    doubt = f"the standard error of {short(misalignment.sigma_px)} PAN px is"
+    if high > limit_px:
+        doubt = (
+            f"{short(high)} PAN px RMS, which one affine may leave, or the standard error of "
+            f"{short(misalignment.sigma_px)} PAN px are"
         )
-    return "; ".join(failed) or (
-        f"the standard error of {short(misalignment.sigma_px)} PAN px is too large for a tolerance "
-        f"of {limit_px:g} PAN px"
-    )
+    return "; ".join(failed) or f"{doubt} too large for a tolerance of {limit_px:g} PAN px"
 
 
 def band_check(

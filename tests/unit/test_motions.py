@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geodelreg.fine.clouds import cloud_look, height_parallax
 from geodelreg.fine.ground import other_motions
-from geodelreg.fine.motions import layers
+from geodelreg.fine.motions import layers, second_motion
 from geodelreg.judge.words import region
 
 Array = NDArray[np.float64]
@@ -67,6 +67,26 @@ def test_patches_that_fit_to_nobody_belong_to_no_layer() -> None:
 def test_a_handful_of_points_is_no_reason_to_fail(count: int) -> None:
     xy = lattice()[:count]
     assert len(layers(xy, np.zeros_like(xy), np.ones(count))) == count
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_chance_makes_no_second_motion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    radius, angle = 22 * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
+    move = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    found = second_motion(move, np.ones(60, dtype=bool), radius_px=1.0, reach_px=22.0)
+    assert found is None or found.member.sum() < 8
+
+
+def test_a_second_motion_is_found_among_patches_placed_anywhere() -> None:
+    rng = np.random.default_rng(4)
+    move = rng.uniform(-15, 15, (80, 2))
+    move[:12] = [9.0, -4.0] + 0.2 * rng.normal(size=(12, 2))
+    found = second_motion(move, np.ones(80, dtype=bool), radius_px=1.0, reach_px=22.0)
+    assert found is not None
+    assert found.member[:12].all()
+    assert np.hypot(*(found.move - [9.0, -4.0])) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -145,8 +165,20 @@ def test_another_layer_counts_unless_one_of_the_two_looks_like_clouds(brighter: 
     move = noisy(np.where(torn[:, None], [[4.0, -3.0]], 0.0), rng)
     label = layers(xy, move, np.full(len(xy), 0.04))
     for side in (torn, ~torn):
-        found = other_motions(move, label, *looks(side, brighter, brighter, rng), len(xy))
+        seen = looks(side, brighter, brighter, rng)
+        found = other_motions(xy, move, label, *seen, len(xy), 22.0)
         assert len(found) == (0 if brighter else 1)
         for motion in found:
             assert motion.member.mean() == pytest.approx(0.25, abs=0.03)
             assert motion.move == pytest.approx([4.0, -3.0], abs=0.1)
+
+
+def test_a_strip_one_patch_wide_counts_and_scattered_patches_do_not() -> None:
+    rng, xy = np.random.default_rng(12), lattice(12)
+    last, scattered = xy[:, 1] > 225, rng.permutation(len(xy)) < 12
+    for moves, count in ((last, 1), (scattered, 0)):
+        move = noisy(np.where(moves[:, None], [[8.0, -3.0]], 0.0), rng)
+        label = layers(xy, move, np.full(len(xy), 0.04))
+        found = other_motions(xy, move, label, *looks(moves, 0.0, 0.0, rng), len(xy), 22.0)
+        assert len(found) == count
+        assert all((motion.member == moves).all() for motion in found)
