@@ -14,6 +14,7 @@ from geodelreg.values.raster import TINY, FloatArray
 _DRAWS = 400
 _ENDS = (2.5, 97.5)
 _FEWEST = 30
+_DIGITS = 9  # what the number of BLAS threads changes lies far below
 _BOUND = 6.0
 _P95_OVER_RMS = math.sqrt(math.log(20.0))
 """Of distances in the plane whose components are normal (Rayleigh's distribution)."""
@@ -71,7 +72,8 @@ def residual_of(
     low2, high2 = np.percentile(distance2.mean(axis=0), _ENDS)
     rms = math.sqrt(float(((gap @ scale.T) ** 2).sum(axis=1).mean()))
     p95 = float(np.percentile(np.hypot(*(gap @ scale.T).T), 95))
-    return Residual(rms, p95, math.sqrt(max(float(low2) - unknown, 0.0)), math.sqrt(float(high2)))
+    low, high = math.sqrt(max(float(low2) - unknown, 0.0)), math.sqrt(float(high2))
+    return Residual(*(round(value, _DIGITS) for value in (rms, p95, low, high)))
 
 
 def _root(covariance: FloatArray) -> FloatArray:
