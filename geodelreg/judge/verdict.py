@@ -163,9 +163,9 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         reasons.append(_at_most("max_scale", evidence.scale, options.max_scale, "scale factor"))
     what = "coarser px from where keypoints, with more certainty, put the ground"
     apart = _at_most("keypoints_apart", evidence.keypoints_apart, MAX_KEYPOINTS_APART, what)
-    what = "of the patches follow another motion"
-    elsewhere = ": ".join([what, evidence.words] if evidence.words else [what])
-    whole = [_at_most("two_motions", evidence.moved, LEAST_SHARE, elsewhere)]
+    where = f": {evidence.words}" if evidence.words else ""
+    what = f"of the patches follow another motion{where}"
+    whole = [_at_most("two_motions", evidence.moved, LEAST_SHARE, what)]
     if options.on_local == "refuse":
         what = "PAN px RMS at least is left by one affine of the ground's bend"
         whole.append(_at_most("local", evidence.residual_low_px, options.max_residual_px, what))
