@@ -16,6 +16,7 @@ COMMANDS = {
     ),
     "bound": ("benchmarks.accuracy.bound", "errors against the Cramér–Rao bound"),
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
+    "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),

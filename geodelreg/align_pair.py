@@ -19,12 +19,13 @@ from geodelreg.fit.choice import Fitted, half_disagreement, select_model
 from geodelreg.fit.models import PARAMETER_COUNT, Frame
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
-from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, verdict
+from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, passes, verdict
+from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import warnings_of
-from geodelreg.options import AlignOptions
+from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
-from geodelreg.values.raster import WindowReader
+from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, Solution, Timings
 
 _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
@@ -126,57 +127,84 @@ def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
     if refined is None:
         return None
     with pair.timings("fit"):
-        part, last = refined.part, refined.last
-        status = on_the_mesh(last)
-        kept = np.flatnonzero(status == Status.KEPT)
-        points = last.points.take(kept)
-        if len(points) < _FEWEST_POINTS:
-            return None
-        negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
-        frame, model = Frame.of(pair), pair.options.model
-        selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
-        estimate = selection.estimate
-        status[kept[~estimate.inlier]] = Status.RESIDUAL
-        tied = tie_points(part, last.matched, estimate.map, status)
-        counts = {
-            "patches": len(tied),
-            "patches matched": int((last.matched.status == Status.KEPT).sum()),
-            "patches kept": int(tied.kept.sum()),
-        }
-        halves = points.take(estimate.inlier)
-        apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
-        sample_size = PARAMETER_COUNT[estimate.model] // 2
-        fitted = Fitted(
-            selection,
-            tied,
-            guess.counts | counts,
-            patches_log_nfa(part, tied, sample_size),
-            pair.pan_px_per_source_px * apart,
-        )
-    return Found(guess, refined, fitted)
+        fitted = fit_patches(pair, guess, refined, on_the_mesh(refined.last))
+    return None if fitted is None else Found(guess, refined, fitted)
+
+
+def fit_patches(
+    pair: Pair, guess: Guess, refined: Refinement, status: StatusArray
+) -> Fitted | None:
+    """The map that the kept patches choose; None of too few."""
+    part, last = refined.part, refined.last
+    kept = np.flatnonzero(status == Status.KEPT)
+    points = last.points.take(kept)
+    if len(points) < _FEWEST_POINTS:
+        return None
+    negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
+    frame, model = Frame.of(pair), pair.options.model
+    selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
+    estimate = selection.estimate
+    status[kept[~estimate.inlier]] = Status.RESIDUAL
+    tied = tie_points(part, last.matched, estimate.map, status)
+    counts = {
+        "patches": len(tied),
+        "patches matched": int((last.matched.status == Status.KEPT).sum()),
+        "patches kept": int(tied.kept.sum()),
+    }
+    halves = points.take(estimate.inlier)
+    apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
+    sample_size = PARAMETER_COUNT[estimate.model] // 2
+    return Fitted(
+        selection,
+        tied,
+        guess.counts | counts,
+        patches_log_nfa(part, tied, sample_size),
+        pair.pan_px_per_source_px * apart,
+    )
 
 
 def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
     """Gather the evidence for a map, judge it, and say all that is known."""
     guess, refined, fitted = found
-    estimate = fitted.selection.estimate
+    options = pair.options
+    notes: tuple[str, ...] = ()
     with pair.timings("evidence"):
         accuracy, evidence = gather(guess, refined, fitted, heard)
+        if passes(judge(evidence, options)):
+            whole = look_at_whole(guess, refined, fitted.map)
+            everyone = hear_everyone(pair, found, whole)
+            if everyone is not None:
+                again = gather(guess, refined, everyone, heard)
+                if passes(judge(again[1], options)):
+                    fitted, (accuracy, evidence) = everyone, again
+                    whole = whole.under(pair, fitted.map)
+            accuracy, evidence = whole.added_to(accuracy, evidence)
+            notes = whole.warnings(options)
         spots = pair.source_lattice(LATTICE)
         move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
         sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px
         moves = is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
+    model = fitted.selection.estimate.model
     names = [pair.source.band_names[band - 1] for band in pair.source_bands]
     return Solution(
-        model=estimate.model,
+        model=model,
         map=fitted.map,
         tie_points=fitted.points,
         accuracy=accuracy,
-        verdict=verdict(judge(evidence, pair.options), moves),
+        verdict=verdict(judge(evidence, options), moves),
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
-        warnings=warnings_of(pair, estimate.model, fitted.points, refined.without_bright),
+        warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
     )
+
+
+def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
+    """The fit to all of the ground, where it is bent; None where those that agree spoke for it."""
+    asked = pair.options
+    if not whole.is_bent(asked) or asked.method != "delaunay" or asked.model in BEYOND_A_HEADER:
+        return None
+    status = whole.status(found.refined.last.status)
+    return fit_patches(pair, found.guess, found.refined, status)
 
 
 def _load_scipy() -> None:

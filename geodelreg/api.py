@@ -17,6 +17,7 @@ from geodelreg.errors import (
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
+from geodelreg.judge.words import remedy_of
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
@@ -104,8 +105,7 @@ def align(
         raise AlignmentRefusedError(
             f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
             + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),
-            "Check that both show the same ground; try --band with the band that looks most like "
-            "PAN, a larger --search-radius, or a simpler --model.",
+            remedy_of(alignment.verdict),
             alignment,
         )
     return alignment
@@ -129,7 +129,8 @@ def check(
     reference : path
         The PAN raster.
     options : AlignOptions, optional
-        Its `tolerance_px` has no meaning here: whatever is found is measured.
+        Its `tolerance_px`, `max_residual_px` and `on_local` have no meaning here: whatever is found
+        is measured, and `limit_px` judges it.
     limit_px : float
         Largest misalignment, anywhere in the overlap, that counts as aligned, PAN pixels.
     per_band : bool
@@ -151,7 +152,8 @@ def check(
     """
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
-    options = replace(options or AlignOptions(), tolerance_px=0.0)
+    options = options or AlignOptions()
+    options = replace(options, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn")
     with _open(source, reference, options) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = part_of(progress, 0, count + 1)

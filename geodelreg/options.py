@@ -116,6 +116,17 @@ class AlignOptions:
         None,
         "Refuse a correction that scales by more than this factor (or by less than its inverse).",
     )
+    max_residual_px: float = _knob(
+        0.5,
+        "Refuse a correction that leaves more PAN pixels RMS, beyond doubt, of the ground's bend: "
+        "relief, a moving sensor, dropped rows.",
+    )
+    on_local: str = _knob(
+        "refuse",
+        "What to do where one affine leaves more than --max-residual: refuse, or write the best "
+        "affine of the whole overlap all the same and warn.",
+        ("refuse", "warn"),
+    )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
     allow: str = _knob(
         "local",
@@ -142,6 +153,8 @@ class AlignOptions:
         _check_range(self, "max_shift_px", 0, 1e9)
         _check_range(self, "max_rotation_deg", 0, 180)
         _check_range(self, "max_scale", 1, 1e3)
+        _check_range(self, "max_residual_px", 0, 1e6)
+        _check_choice(self, "on_local")
         _check_range(self, "threads", 0, 1024)
 
 

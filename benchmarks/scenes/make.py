@@ -29,6 +29,7 @@ BAND_GAMMAS = (1.0, 0.96, 1.05, 0.9)
 BAND_GAINS = (1.1, 1.0, 0.95, 0.85)
 BLUR_MS_PX = 0.35
 HEADER_EDGE_PX = 24
+Bend = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,12 @@ class Scene:
     nodata: int | None = None
 
 
-def make_scene(spec: SceneSpec, imagery: Imagery) -> Scene:
+def make_scene(
+    spec: SceneSpec,
+    imagery: Imagery,
+    bend: Bend | None = None,
+    band_shifts: tuple[tuple[float, float], ...] = (),
+) -> Scene:
     """Render one scene.
 
     Parameters
@@ -170,6 +176,11 @@ def make_scene(spec: SceneSpec, imagery: Imagery) -> Scene:
     spec : SceneSpec
     imagery : Imagery
         The same imagery and spec give the same scene, bit by bit.
+    bend : callable, optional
+        (..., 2) PAN pixels where the truth of the scene puts MS pixels to the (..., 2) PAN pixels
+        by which their content lies beyond: what no header expresses.
+    band_shifts : tuple of (float, float)
+        Of every MS band, in PAN pixels, beyond that.
     """
     rng = np.random.default_rng(zlib.crc32(spec.name.encode()))
     if spec.variant == "large":
@@ -177,7 +188,10 @@ def make_scene(spec: SceneSpec, imagery: Imagery) -> Scene:
     truth, ground, placement = lay_out(spec, imagery)
     pan_ground, ms_ground, nodata = _variants(spec, ground, rng)
     pan = _expose_pan(pan_ground, spec.pan_weights, rng)
-    ms = _expose_ms(ms_ground, placement, rng)
+    if bend is not None:
+        in_pan = placement.centres_px - ground.offset
+        placement = replace(placement, centres_px=placement.centres_px + bend(in_pan))
+    ms = _expose_ms(ms_ground, placement, rng, band_shifts)
     if nodata is not None:
         _cut_wedges(ms, pan)
     return Scene(ms, pan, truth, nodata)
@@ -299,11 +313,18 @@ def _expose_pan(
 
 
 def _expose_ms(
-    ground: Ground, placement: Placement, rng: np.random.Generator
+    ground: Ground,
+    placement: Placement,
+    rng: np.random.Generator,
+    band_shifts: tuple[tuple[float, float], ...] = (),
 ) -> NDArray[np.uint16]:
+    shifts = band_shifts or ((0.0, 0.0),) * len(ground.bands)
+    places = [replace(placement, centres_px=placement.centres_px + shift) for shift in shifts]
     bands = [
-        digitise(tone(render(band, placement, BLUR_MS_PX), gamma, gain), rng)
-        for band, gamma, gain in zip(ground.bands, BAND_GAMMAS, BAND_GAINS, strict=True)
+        digitise(tone(render(band, place, BLUR_MS_PX), gamma, gain), rng)
+        for band, place, gamma, gain in zip(
+            ground.bands, places, BAND_GAMMAS, BAND_GAINS, strict=True
+        )
     ]
     return np.stack(bands)
 

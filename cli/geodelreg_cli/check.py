@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 VERDICT, MEASUREMENT = "Verdict", "How to measure"
 MISALIGNED = 4
+RUNS = ("threads", "allow")
+JUDGED = {"tolerance_px": 0.0, "max_residual_px": 0.5, "on_local": "warn"}
+"""By --tolerance, in the place of what `align` has."""
 
 EPILOG = """\
 Examples:
@@ -72,7 +75,7 @@ def check_params() -> list[SectionOption]:
             section=VERDICT,
             help="Print the report on stdout in place of the text; its block is .check.",
         ),
-        *knob_options(AlignOptions, MEASUREMENT, without=["threads", "allow", "tolerance_px"]),
+        *knob_options(AlignOptions, MEASUREMENT, without=[*RUNS, *JUDGED]),
         *run_options(),
     ]
 
@@ -89,7 +92,7 @@ def check(rasters: tuple[str, ...], **given: Any) -> int:
     """
     start_run(given)
     sources, reference = ms_and_pan(rasters)
-    options = build(AlignOptions, given | {"tolerance_px": 0.0})
+    options = build(AlignOptions, given | JUDGED)
     import geodelreg
 
     with progress_bar(given["quiet"]) as bar:

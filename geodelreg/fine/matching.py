@@ -64,7 +64,7 @@ def match_pass(
     with ThreadPoolExecutor(threads or part.pair.threads) as pool:
         found = [m for m in pool.map(one, _grouped(tiles, options)) if m is not None]
     matched = Matched.joined(found)
-    points = _observe(part, matched, correction)
+    points = observe(part, matched, correction)
     status = matched.status.copy()
     status[~np.isfinite(points.covariance).all(axis=(1, 2))] = Status.TEXTURE
     frame = Frame.of(part.pair)
@@ -90,7 +90,7 @@ def _grouped(tiles: list[Tile], options: MatchOptions) -> Iterator[list[Tile]]:
         yield group
 
 
-def _observe(part: Roles, matched: Matched, correction: PixelMap) -> Observations:
+def observe(part: Roles, matched: Matched, correction: PixelMap) -> Observations:
     """Patches as pairs of MS pixel and MS header pixel, with covariance in MS pixels."""
     back = Inverse(part.pair.header)
     if part.ms_is_template:

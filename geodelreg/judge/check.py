@@ -19,8 +19,11 @@ def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
 
     An affine displacement is longest at a corner, and so is its standard error.
     """
-    if not solution.verdict.accepted:
+    if not solution.verdict.knows_the_place:
         return Misalignment()
+    moved = [
+        r.message for r in solution.verdict.reasons if r.name == "two_motions" and not r.passed
+    ]
     corners = overlap_corners(roles(pair), solution.map)
     moves = pair.move_px(solution.map, corners)
     return Misalignment(
@@ -28,14 +31,16 @@ def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
         distance_m=float(np.hypot(*(moves * np.array(pair.reference_gsd_m)).T).max()),
         sigma_px=solution.accuracy.sigma_corner_px,
         local_px=local_distortion(solution.tie_points),
+        residual_interval_px=solution.accuracy.residual_interval_px,
+        moved="".join(moved),
     )
 
 
 def judge_misalignment(misalignment: Misalignment, limit_px: float) -> CheckOutcome:
-    """Misaligned when significantly more than `limit_px` off, in whole or locally.
+    """Misaligned when significantly more than `limit_px` off, in whole or locally, or torn.
 
     Otherwise aligned, provided that the measurement is sharp enough to have shown a misalignment of
-    the limit's size.
+    the limit's size, in whole and locally.
 
     Parameters
     ----------
@@ -46,9 +51,11 @@ def judge_misalignment(misalignment: Misalignment, limit_px: float) -> CheckOutc
     doubt = SIGNIFICANCE * misalignment.sigma_px
     if math.isnan(doubt):
         return CheckOutcome.CANNOT_TELL
-    if misalignment.distance_px - doubt > limit_px or misalignment.local_px > limit_px:
+    low, high = _interval(misalignment)
+    off = math.hypot(max(misalignment.distance_px - doubt, 0.0), low)
+    if misalignment.moved or off > limit_px or misalignment.local_px > limit_px:
         return CheckOutcome.MISALIGNED
-    return CheckOutcome.ALIGNED if doubt <= limit_px else CheckOutcome.CANNOT_TELL
+    return CheckOutcome.ALIGNED if max(doubt, high) <= limit_px else CheckOutcome.CANNOT_TELL
 
 
 def is_affine_enough(misalignment: Misalignment, limit_px: float, points: TiePoints) -> bool | None:
@@ -58,6 +65,12 @@ def is_affine_enough(misalignment: Misalignment, limit_px: float, points: TiePoi
     """
     if math.isnan(misalignment.local_px):
         return None
-    if misalignment.local_px > min(LOCAL_RMS_PX, limit_px):
+    if max(misalignment.local_px, _interval(misalignment)[0]) > min(LOCAL_RMS_PX, limit_px):
         return False
     return None if many_elsewhere(points) else True
+
+
+def _interval(misalignment: Misalignment) -> tuple[float, float]:
+    """Ends of what one affine leaves, PAN pixels; 0 where nothing is known."""
+    low, high = (0.0 if math.isnan(end) else end for end in misalignment.residual_interval_px)
+    return low, high

@@ -12,7 +12,7 @@ from geodelreg.fine.layers import Claim, bands_apart, keypoints_apart, rival_mot
 from geodelreg.fine.matching import match_bands
 from geodelreg.fine.overlay import Overlay, overlay, widened
 from geodelreg.fine.passes import COARSE_SIGMA, Refinement
-from geodelreg.fine.surface import make_surface
+from geodelreg.fine.surface import Surface, make_surface
 from geodelreg.fine.tiles import dark_tile, overview_tile
 from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
@@ -24,7 +24,7 @@ from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
-from geodelreg.values.raster import TINY
+from geodelreg.values.raster import TINY, Band
 from geodelreg.values.result import Accuracy
 
 _SURE_LOG_CHANCE = -12.0  # far beyond the gate's −8: all patches would say the same
@@ -88,22 +88,37 @@ def _overlays(
 
     The third is the second with all that was read of the finer image.
     """
-    part, tone = refined.part, refined.tuning.tone
-    tile = overview_tile(part, guess.images)
-    if refined.dark_only:
-        tile = dark_tile(part, tile, guess)
-    template, finer = tile.template[0], tile.surface[0]
-    if part.ms_is_template:
-        template = tone(tile.template)
-    else:
-        finer = tone(tile.surface)
-    surface = make_surface(finer, part.surface.grid, surface_sigma(part, tile, COARSE_SIGMA))
+    part = refined.part
+    template, finer, surface = decimated(guess, refined, refined.dark_only)
     wide = widened(part, template, finer, correction)
     everything = overlay(part, wide, surface, correction)
     left, top = (round(v) for v in ~wide.grid.transform @ (template.grid.transform @ (0, 0)))
     height, width = template.data.shape
     after = everything.part(slice(top, top + height), slice(left, left + width))
     return overlay(part, template, surface, IDENTITY), after, everything
+
+
+def decimated(guess: Guess, refined: Refinement, dark: bool) -> tuple[Band, Band, Surface]:
+    """Both images, decimated: the coarser, the finer, and what that shows at the former's size.
+
+    Parameters
+    ----------
+    guess : Guess
+    refined : Refinement
+    dark : bool
+        Leave bright objects out.
+    """
+    part, tone = refined.part, refined.tuning.tone
+    tile = overview_tile(part, guess.images)
+    if dark:
+        tile = dark_tile(part, tile, guess)
+    template, finer = tile.template[0], tile.surface[0]
+    if part.ms_is_template:
+        template = tone(tile.template)
+    else:
+        finer = tone(tile.surface)
+    sigma = surface_sigma(part, tile, COARSE_SIGMA)
+    return template, finer, make_surface(finer, part.surface.grid, sigma)
 
 
 def _turn_and_scale(pair: Pair, correction: PixelMap) -> tuple[float, float]:

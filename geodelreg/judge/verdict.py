@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.options import AlignOptions
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
@@ -72,6 +73,12 @@ class Evidence:
         standard errors.
     keypoints_apart : float
         Coarser pixels between the correction and what stronger, refused keypoint matches say.
+    residual_low_px : float
+        Lower end of the 95 % interval of what the correction leaves of the ground's smooth map.
+    moved : float
+        Share of the textured patches that agree on another motion than the ground's.
+    words : str
+        Where those lie.
     """
 
     points: int
@@ -88,6 +95,9 @@ class Evidence:
     support: float
     bands_apart: float
     keypoints_apart: float
+    residual_low_px: float = 0.0
+    moved: float = 0.0
+    words: str = ""
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -103,20 +113,33 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         ("max_rotation", "≤", options.max_rotation_deg, "deg rotation"),
         ("max_scale", "≤", options.max_scale, "scale factor"),
     )
+    where = f": {evidence.words}" if evidence.words else ""
+    most_px = options.max_residual_px if options.on_local == "refuse" else None
+    whole = (
+        ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
+        ("local", "≤", most_px, "PAN px RMS at least is left by one affine of the ground's bend"),
+    )
     values = asdict(evidence) | {
         "tie_points": evidence.points,
         "log_together": evidence.log_nfa + evidence.log_chance,
         "max_shift": evidence.shift_px,
         "max_rotation": evidence.rotation_deg,
         "max_scale": evidence.scale,
+        "two_motions": evidence.moved,
+        "local": evidence.residual_low_px,
     }
     reasons = []
-    for name, relation, limit, what in (*_LIMITS, *asked, *_LAST_LIMITS):
+    for name, relation, limit, what in (*_LIMITS, *asked, *_LAST_LIMITS, *whole):
         if limit is not None:
             apart_from = _APART_FROM[options.method == "delaunay"] if what.endswith("and") else ""
             words = f"{what} {apart_from}".rstrip()
             reasons.append(_reason(name, values[name], relation, limit, words))
     return tuple(reasons)
+
+
+def passes(reasons: tuple[Reason, ...]) -> bool:
+    """True when nothing speaks against a correction."""
+    return all(reason.passed for reason in reasons)
 
 
 def nothing_agrees() -> Reason:
@@ -127,7 +150,7 @@ def nothing_agrees() -> Reason:
 
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:
     """Aligned or already aligned when every reason passed, else refused."""
-    if not all(reason.passed for reason in reasons):
+    if not passes(reasons):
         return Verdict(Outcome.REFUSED, reasons)
     return Verdict(Outcome.ALIGNED if moves else Outcome.ALREADY_ALIGNED, reasons)
 

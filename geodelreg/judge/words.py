@@ -8,7 +8,8 @@ from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
 from geodelreg.fit.choice import spatial_blocks
 from geodelreg.pair import Pair, bands_asked
 from geodelreg.values.points import TiePoints
-from geodelreg.values.raster import FloatArray
+from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.result import Verdict
 
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
@@ -88,3 +89,61 @@ def local_distortion(points: TiePoints) -> float:
     excess = np.mean(np.square(means), axis=0) - np.mean(noise, axis=0)
     doubt = _LOCAL_SIGNIFICANCE * np.mean(noise, axis=0) * np.sqrt(2 / len(means))
     return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))
+
+
+def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
+    """Where some of the patches lie, in words: "the lower 45 %", "the right 20 %", "a part at …".
+
+    Parameters
+    ----------
+    xy : (N, 2) float64
+        All patches.
+    member : (N,) bool
+    size : (float, float)
+        Width and height of the raster, in the same pixels.
+    """
+    share = f"{100 * member.mean():.0f} %"
+    if not member.any():
+        return "nowhere"
+    best, name = 0.0, ""
+    for axis, names in ((0, ("left", "right")), (1, ("upper", "lower"))):
+        order = np.argsort(xy[:, axis], kind="stable")
+        for ends, word in zip((order, order[::-1]), names, strict=True):
+            inside = member[ends[: int(member.sum())]].mean()
+            if inside > best:
+                best, name = float(inside), word
+    if best >= 0.9:
+        return f"the {name} {share}"
+    x, y = xy[member].mean(axis=0) / size
+    across = ("left", "middle", "right")[min(int(3 * x), 2)]
+    down = ("upper", "middle", "lower")[min(int(3 * y), 2)]
+    where = "middle" if across == down == "middle" else f"{down} {across}".replace("middle ", "")
+    return f"{share} in the {where}"
+
+
+def lies(move_px: FloatArray) -> str:
+    """Where a part lies that is (2,) PAN pixels right and down of the rest, in words."""
+    right, down = (float(v) for v in move_px)
+    across = f"{abs(right):.2g} px {'right' if right >= 0 else 'left'}"
+    along = f"{abs(down):.2g} px {'down' if down >= 0 else 'up'}"
+    return f"lies {across} and {along} of the rest"
+
+
+def remedy_of(verdict: Verdict) -> str:
+    """What can be done about a refusal."""
+    failed = {reason.name for reason in verdict.reasons if not reason.passed}
+    if failed == {"local"}:
+        return (
+            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
+            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
+            "part by part."
+        )
+    if "two_motions" in failed and failed <= {"two_motions", "local"}:
+        return (
+            "Mask the part that moves (--mask), or cut the raster there (gdal_translate -srcwin) "
+            "and align each part."
+        )
+    return (
+        "Check that both show the same ground; try --band with the band that looks most like PAN, "
+        "a larger --search-radius, or a simpler --model."
+    )

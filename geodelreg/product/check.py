@@ -101,15 +101,23 @@ def explanation(
     outcome: CheckOutcome, misalignment: Misalignment, alignment: Alignment, limit_px: float
 ) -> str:
     """What the figures do not show: why nothing can be told, or that the misalignment is local."""
-    if outcome is CheckOutcome.MISALIGNED and misalignment.local_px > limit_px:
-        return f"{short(misalignment.local_px)} PAN px RMS of local distortion"
+    low, high = misalignment.residual_interval_px
+    if outcome is CheckOutcome.MISALIGNED:
+        if misalignment.moved:
+            return misalignment.moved
+        if misalignment.local_px > limit_px or low > limit_px:
+            local = max(misalignment.local_px, low) if low > limit_px else misalignment.local_px
+            return f"{short(local)} PAN px RMS of local distortion"
     if outcome is not CheckOutcome.CANNOT_TELL:
         return ""
     failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
-    return "; ".join(failed) or (
-        f"the standard error of {short(misalignment.sigma_px)} PAN px is too large for a tolerance "
-        f"of {limit_px:g} PAN px"
-    )
+    doubt = f"the standard error of {short(misalignment.sigma_px)} PAN px is"
+    if high > limit_px:
+        doubt = (
+            f"{short(high)} PAN px RMS, which one affine may leave, or the standard error of "
+            f"{short(misalignment.sigma_px)} PAN px are"
+        )
+    return "; ".join(failed) or f"{doubt} too large for a tolerance of {limit_px:g} PAN px"
 
 
 def band_check(
@@ -203,7 +211,8 @@ def _local_line(check: Check) -> str:
         return (
             "Too few tie points agree, or too many lie elsewhere, to tell if one affine is enough."
         )
-    left = check.misalignment.local_px
+    low = check.misalignment.residual_interval_px[0]
+    left = max(check.misalignment.local_px, low if math.isfinite(low) else 0.0)
     local = f"{short(left)} PAN px RMS of smooth distortion" if left else "no smooth distortion"
     if check.affine_enough:
         return f"One affine is enough: it leaves {local}."

@@ -21,7 +21,7 @@ from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.2"
+SCHEMA_VERSION = "1.3"
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
 """What terminals obey and JSON need not escape."""
 

@@ -83,6 +83,12 @@ class Verdict:
         """True unless refused."""
         return self.outcome is not Outcome.REFUSED
 
+    @property
+    def knows_the_place(self) -> bool:
+        """True unless refused for want of evidence; parts of the ground may lie elsewhere."""
+        failed = {reason.name for reason in self.reasons if not reason.passed}
+        return self.accepted or (bool(failed) and failed <= {"local", "two_motions"})
+
 
 class CheckOutcome(Enum):
     """What a check ended as."""
@@ -104,12 +110,18 @@ class Misalignment:
         Standard error of the distance, that of the worst corner.
     local_px : float
         RMS of smooth distortion that no affine transformation takes away, PAN pixels.
+    residual_interval_px : (float, float)
+        95 % interval of what one affine leaves of the ground's map, RMS, PAN pixels.
+    moved : str
+        Which part lies elsewhere than the rest, and where; empty when none does.
     """
 
     distance_px: float = float("nan")
     distance_m: float = float("nan")
     sigma_px: float = float("nan")
     local_px: float = float("nan")
+    residual_interval_px: tuple[float, float] = (float("nan"), float("nan"))
+    moved: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +144,11 @@ class Accuracy:
         The paper's grey-value RMSE after histogram matching, in DN.
     ncc_before, ncc_after : float
         Correlation of the areas under the original and the corrected header.
+    residual_rms_px, residual_p95_px : float
+        What the correction leaves of the ground's smooth map where both images show it, without
+        the noise of patches: root mean square and 95th percentile.
+    residual_interval_px : (float, float)
+        95 % interval of that root mean square.
     kept, checked : int
         Numbers of points.
     """
@@ -150,6 +167,9 @@ class Accuracy:
     e1_after: float = float("nan")
     ncc_before: float = float("nan")
     ncc_after: float = float("nan")
+    residual_rms_px: float = float("nan")
+    residual_p95_px: float = float("nan")
+    residual_interval_px: tuple[float, float] = (float("nan"), float("nan"))
     kept: int = 0
     checked: int = 0
 

@@ -31,6 +31,8 @@ GOOD = Evidence(
     support=0.95,
     bands_apart=0.1,
     keypoints_apart=0.0,
+    residual_low_px=0.0,
+    moved=0.0,
 )
 # as docs/method.md tells them
 UPPER = {
@@ -42,6 +44,8 @@ UPPER = {
     "rival_motion": 0.67,
     "bands_apart": 0.5,
     "keypoints_apart": 2.0,
+    "residual_low_px": 0.5,
+    "moved": 0.05,
 }
 LOWER = {"points": 8, "coverage": 0.05, "support": 0.5}
 ASKED = {

@@ -1,0 +1,125 @@
+"""Which patches are the ground's, and what the others are: clouds, another motion, or nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.fine.clouds import CloudLook, cloud_look
+from geodelreg.fine.motions import (
+    LEAST_PATCHES,
+    LEAST_SHARE,
+    Motion,
+    is_solid,
+    layers,
+    second_motion,
+)
+from geodelreg.fit.consensus import consensus_affine
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
+
+_CORE_SIGMAS = 3.0
+_CORE_FLOOR_PX = 0.05
+"""Of a rigid ground: what interpolation and unlike point spreads leave, coarser pixels."""
+_ANOTHER_PX = 1.5
+"""From which a motion is another one: dense matching reaches so far, and follows what is nearer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What the patches that were placed belong to.
+
+    Attributes
+    ----------
+    member : (N,) bool
+        Patches of the ground.
+    label : (N,) intp
+        Layers as `geodelreg.fine.motions.layers` numbers them; all 0 or -1 where clouds explain
+        what moves, -1 being the clouds.
+    look : CloudLook
+        Of the patches that do not fit to the affine that most agree on.
+    """
+
+    member: BoolArray
+    label: IntArray
+    look: CloudLook
+
+
+def find_ground(
+    source: FloatArray,
+    target: FloatArray,
+    variance_px2: FloatArray,
+    brightness: FloatArray,
+    roughness: FloatArray,
+) -> Ground:
+    """Tell the ground from what moves differently.
+
+    Where clouds explain what moves, the ground is what one affine explains: it kept still.
+    Elsewhere it is the largest layer, bent as it may be.
+
+    Parameters
+    ----------
+    source, target : (N, 2) float64
+        Patches, and where they lie under the header, in pixels of the coarser image.
+    variance_px2 : (N,) float64
+        Trace of the covariance of `target`.
+    brightness, roughness : (N,) float64
+        As for `geodelreg.fine.clouds.cloud_look`.
+    """
+    tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
+    core = consensus_affine(source, target, variance_px2, tolerance)
+    look = cloud_look(~core.inliers, brightness, roughness)
+    if look.explains:
+        return Ground(core.inliers, np.where(core.inliers, 0, -1).astype(np.intp), look)
+    label = layers(source, target - source, np.sqrt(variance_px2))
+    return Ground(label == 0, label, look)
+
+
+def other_motions(
+    source: FloatArray,
+    move: FloatArray,
+    label: IntArray,
+    brightness: FloatArray,
+    roughness: FloatArray,
+    textured: int,
+    reach_px: float,
+) -> list[Motion]:
+    """Motions besides the ground's that so many patches share that no result may ignore them.
+
+    Strips one patch wide are no layer, for most of their neighbours are the ground's; they count
+    when they agree, and no other patches lie among them.
+
+    Parameters
+    ----------
+    source : (N, 2) float64
+    move : (N, 2) float64
+        Where patches were placed minus where the ground's map puts them, coarser pixels.
+    label : (N,) intp
+        Layers; 0 is the ground.
+    brightness, roughness : (N,) float64
+        As for `find_ground`: one of two layers that is brighter and smoother is a bank of clouds.
+    textured : int
+        Number of all textured patches, placed or not.
+    reach_px : float
+        Of the search that placed them.
+
+    Returns
+    -------
+    list of Motion
+        The largest first.
+    """
+    least = max(LEAST_SHARE * textured, LEAST_PATCHES)
+    found = []
+    for number in range(1, int(label.max(initial=0)) + 1):
+        member = label == number
+        centre = np.median(move[member], axis=0)
+        if member.sum() < least or not np.hypot(*centre) > _ANOTHER_PX:
+            continue
+        both = member | (label == 0)
+        if not cloud_look(member[both], brightness[both], roughness[both]).tells_layers_apart:
+            found.append(Motion(member, centre))
+    strays = (label < 0) & (np.hypot(*move.T) > _ANOTHER_PX)
+    strip = second_motion(move, strays, _ANOTHER_PX, reach_px)
+    if strip is not None and strip.member.sum() >= least and is_solid(source, strip.member):
+        found.append(strip)
+    return sorted(found, key=lambda motion: -int(motion.member.sum()))

@@ -1,0 +1,175 @@
+"""What moves together: the ground's smooth map, other motions, and what agrees with nothing.
+
+Neighbouring patches of one smooth map differ by no more than its strain allows.  Edges of the
+Delaunay triangulation that differ by more are cut; what stays connected is one layer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
+
+MOST_STRAIN = 0.04
+"""Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
+LEAST_SHARE = 0.05
+LEAST_PATCHES = 8
+_CHANCE = 1e-3
+"""Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
+_SOLID = 0.9
+_ROUNDING_PX = 1e-6
+_CORE = 0.75
+"""Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
+those astride a tear fit to both sides a little, and to neither well."""
+_MEDIAN_GAP = math.sqrt(4.0 * math.log(2.0) / 2.0)
+"""Median distance of two points of unit radial standard error (Rayleigh's distribution)."""
+_NOISE_SIGMAS = 2.5
+_SLIVER = 0.2
+"""Altitude over longest side below which a triangle joins places along the hull, no neighbours."""
+
+
+def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
+    """Number of the layer of each patch, the largest being 0; -1 of a patch that fits to none.
+
+    Parameters
+    ----------
+    xy : (N, 2) float64
+        Where the patches are.
+    move : (N, 2) float64
+        Their displacements, in the same pixels.
+    sigma_px : (N,) float64
+        Radial standard errors of the displacements.
+
+    Returns
+    -------
+    (N,) intp
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(xy)
+    label = np.full(count, -1, dtype=np.intp)
+    pairs = _edges(xy)
+    good = _smooth(xy, move, sigma_px, pairs)
+    fits = np.bincount(pairs[good].ravel(), minlength=count)
+    total = np.bincount(pairs.ravel(), minlength=count)
+    core = (total > 0) & (fits >= _CORE * total)
+    inner = good & core[pairs].all(axis=1)
+    graph = coo_matrix(
+        (np.ones(int(inner.sum())), (pairs[inner, 0], pairs[inner, 1])), shape=(count, count)
+    )
+    _, found = connected_components(graph, directed=False)
+    size = np.bincount(found[core], minlength=int(found.max(initial=-1)) + 1)
+    rank = np.empty(len(size), dtype=np.intp)
+    rank[np.argsort(-size, kind="stable")] = np.arange(len(size))
+    label[core] = rank[found[core]]
+    # the others belong to the layer of most of the neighbours that they fit to
+    number = max(int(label.max(initial=-1)) + 1, 1)
+    votes = np.zeros((count, number), dtype=np.intp)
+    for one, other in (pairs[good].T, pairs[good].T[::-1]):
+        known = core[other] & ~core[one]
+        np.add.at(votes, (one[known], label[other[known]]), 1)
+    edge = ~core & (votes.max(axis=1) > 0)
+    label[edge] = votes[edge].argmax(axis=1)
+    return label
+
+
+def _edges(xy: FloatArray) -> IntArray:
+    """(E, 2) edges of the Delaunay triangulation."""
+    from scipy.spatial import Delaunay, QhullError
+
+    if len(xy) < 4:
+        return np.empty((0, 2), dtype=np.intp)
+    try:
+        triangle = Delaunay(xy, qhull_options="QJ Pp").simplices
+    except QhullError:
+        return np.empty((0, 2), dtype=np.intp)
+    corner = xy[triangle]
+    side = corner - np.roll(corner, 1, axis=1)
+    longest2 = (side**2).sum(axis=2).max(axis=1)
+    twice_area = np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
+    triangle = triangle[twice_area > _SLIVER * longest2]
+    both = np.sort(np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]]))
+    return np.asarray(np.unique(both, axis=0), dtype=np.intp)
+
+
+def _smooth(xy: FloatArray, move: FloatArray, sigma_px: FloatArray, pairs: IntArray) -> BoolArray:
+    """(E,) True where two ends differ by no more than strain and noise allow."""
+    one, other = pairs.T
+    step = np.hypot(*(xy[one] - xy[other]).T)
+    gap = np.hypot(*(move[one] - move[other]).T)
+    common = float(np.median(gap)) / _MEDIAN_GAP if len(gap) else 0.0
+    noise = np.hypot(np.maximum(sigma_px[one], common), np.maximum(sigma_px[other], common))
+    return np.asarray(gap <= MOST_STRAIN * step + _NOISE_SIGMAS * noise)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Patches that agree on another displacement than the ground's.
+
+    Attributes
+    ----------
+    member : (N,) bool
+    move : (2,) float64
+        Mean displacement of the members against the ground, in the pixels given.
+    """
+
+    member: BoolArray
+    move: FloatArray
+
+
+def second_motion(
+    move: FloatArray, candidate: BoolArray, radius_px: float, reach_px: float
+) -> Motion | None:
+    """The largest group of patches that agree on one displacement, if chance makes no such group.
+
+    A contrario: a patch that shows nothing of the other image is placed anywhere within reach,
+    uniformly and by itself (Desolneux, Moisan & Morel 2008, chapter 3).
+
+    Parameters
+    ----------
+    move : (N, 2) float64
+        Displacement of the patches against the ground's map.
+    candidate : (N,) bool
+        Patches that the ground's map does not explain.
+    radius_px : float
+        Within which displacements agree.
+    reach_px : float
+        Radius of the search that found the displacements.
+
+    Returns
+    -------
+    Motion or None
+    """
+    from scipy.special import bdtrc
+
+    index = np.flatnonzero(candidate)
+    if len(index) < 2:
+        return None
+    gap = np.hypot(*(move[index][:, None] - move[index][None]).transpose(2, 0, 1))
+    near = gap <= radius_px
+    best = int(near.sum(axis=1).argmax())
+    centre = move[index][near[best]].mean(axis=0)
+    inside = np.hypot(*(move[index] - centre).T) <= radius_px
+    count, total = int(inside.sum()), len(index)
+    share = min((radius_px / reach_px) ** 2, 1.0)
+    # one of the members gave the place, so one less speaks for it
+    tail = float(bdtrc(count - 2, total - 1, share)) if count > 1 else 1.0
+    log_nfa = math.log10(total) + math.log10(max(tail, 1e-300))
+    if log_nfa > math.log10(_CHANCE):
+        return None
+    member = np.zeros(len(move), dtype=bool)
+    member[index[inside]] = True
+    return Motion(member, centre)
+
+
+def is_solid(xy: FloatArray, member: BoolArray) -> bool:
+    """True when hardly any other of (N, 2) patches lies among the members: they are one part."""
+    from shapely import MultiPoint, contains_xy
+
+    around = MultiPoint(xy[member]).convex_hull.buffer(_ROUNDING_PX)
+    inside = contains_xy(around, xy[:, 0], xy[:, 1])
+    return bool(member[inside].mean() >= _SOLID)

@@ -1,0 +1,148 @@
+"""Where every patch of one image lies on the other, far and near: what dense matching left unasked.
+
+Dense matching says nothing of patches that lie beyond its reach, and an image torn in two has many
+of them.  Here each patch of an overlay is correlated with all places around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from geodelreg.fine.overlay import Overlay
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
+
+REACH_PX = 22
+"""Of the search; with patches of 20 pixels the windows measure 64."""
+
+_LEAST_VALID = 0.8
+_CORRELATION_LENGTH_PX = 2.0
+_NOISE_SHARE = 0.6745
+_LARGEST_SIGMA_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Best places of the patches of an overlay.
+
+    Attributes
+    ----------
+    centre : (P, 2) float64
+        In pixels of the overlay, outer corner.
+    move : (P, 2) float64
+        From where the overlay's correction puts a patch to where it correlates best, same pixels.
+    score, here : (P,) float64
+        Absolute correlation there, and where the correction puts the patch.
+    textured : (P,) bool
+        The patch shows enough to be placed.
+    brightness : (P,) float64
+        Mean of the template.
+    roughness : (P,) float64
+        Contrast between neighbouring pixels of the template over the contrast of the patch.
+    size : int
+        Side of a patch.
+    """
+
+    centre: FloatArray
+    move: FloatArray
+    score: FloatArray
+    here: FloatArray
+    textured: BoolArray
+    brightness: FloatArray
+    roughness: FloatArray
+    size: int
+
+    @property
+    def z(self) -> FloatArray:
+        """(P,) by how many standard errors the best place correlates better (Fisher 1915)."""
+        independent = (self.size / _CORRELATION_LENGTH_PX) ** 2 - 3
+        there, here = (np.arctanh(np.minimum(r, 0.999)) for r in (self.score, self.here))
+        better = there - here
+        return np.asarray(better * np.sqrt(independent / 2))
+
+
+def survey(overlay: Overlay, size: int = 20, reach: int = REACH_PX) -> Places:
+    """Correlate every patch with all places up to `reach` pixels away.
+
+    Parameters
+    ----------
+    overlay : Overlay
+        The surface under the correction to be judged.
+    size : int
+        Side of a patch.
+    reach : int
+    """
+    template = _filled(overlay.template, overlay.template_valid)
+    surface = _filled(overlay.surface, overlay.surface_valid)
+    noise = _noise(template, overlay.template_valid)
+    height, width = template.shape
+    padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
+    rows = []
+    for top in range((height % size) // 2, height - size + 1, size):
+        for left in range((width % size) // 2, width - size + 1, size):
+            mine = slice(top, top + size), slice(left, left + size)
+            shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
+            if min(shown) < _LEAST_VALID:
+                continue
+            patch = template[mine]
+            window = padded[top : top + size + 2 * reach, left : left + size + 2 * reach]
+            scores = np.abs(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
+            scores[~np.isfinite(scores) | (scores > 1.0 + 1e-3)] = 0.0
+            row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+            move = _peak(scores, int(row), int(column)) - reach
+            rows.append(
+                [
+                    *(left + size / 2, top + size / 2),
+                    *move,
+                    *(scores[row, column], scores[reach, reach]),
+                    *(_sigma(patch, noise), float(patch.mean()), _roughness(patch)),
+                ]
+            )
+    found = np.array(rows).reshape(-1, 9)
+    centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
+    score, here, sigma, brightness, roughness = rest
+    return Places(centre, move, score, here, sigma < _LARGEST_SIGMA_PX, brightness, roughness, size)
+
+
+def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:
+    """The image less its mean, 0 where it is not valid."""
+    level = np.float32(image[valid].mean()) if valid.any() else np.float32(0)
+    return np.where(valid, image - level, np.float32(0)).astype(np.float32)
+
+
+def _noise(image: Float32Array, valid: BoolArray) -> float:
+    """Standard deviation of the pixels' noise, at most (Immerkær 1996, by the median)."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+    rough = np.abs(cv2.filter2D(image, cv2.CV_32F, kernel))[valid]
+    return float(np.median(rough)) / _NOISE_SHARE if len(rough) else 0.0
+
+
+def _sigma(patch: Float32Array, noise: float) -> float:
+    """Standard error that least-squares matching could reach, along the worse axis, pixels."""
+    across = (patch[1:-1, 2:] - patch[1:-1, :-2]).ravel() / 2
+    down = (patch[2:, 1:-1] - patch[:-2, 1:-1]).ravel() / 2
+    xx, yy, xy = (float(v) for v in (across @ across, down @ down, across @ down))
+    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    return noise / float(np.sqrt(least)) if least > 0 else np.inf
+
+
+def _roughness(patch: Float32Array) -> float:
+    """Of neighbouring pixels' second differences to the whole patch, standard deviations."""
+    inner = patch[1:-1, 1:-1]
+    around = patch[:-2, 1:-1] + patch[2:, 1:-1] + patch[1:-1, :-2] + patch[1:-1, 2:]
+    fine = float(np.sqrt(np.mean((4 * inner - around) ** 2) / 20))
+    return fine / max(float(patch.std()), 1e-12)
+
+
+def _peak(scores: Float32Array, row: int, column: int) -> FloatArray:
+    """(2,) column and row of the maximum, by a parabola along each axis."""
+    out = np.array([column, row], dtype=np.float64)
+    for axis, (at, line) in enumerate(((column, scores[row]), (row, scores[:, column]))):
+        if 0 < at < len(line) - 1:
+            left, middle, right = (float(v) for v in line[at - 1 : at + 2])
+            bend = left - 2 * middle + right
+            if bend < 0:
+                out[axis] += (left - right) / (2 * bend)
+    return out

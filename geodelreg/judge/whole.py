@@ -1,0 +1,271 @@
+"""Whether a correction speaks for the whole raster, or only for the patches that agree with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geodelreg.fine.clouds import HeightParallax, height_parallax
+from geodelreg.fine.ground import Ground, find_ground, other_motions
+from geodelreg.fine.layers import ELSEWHERE
+from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
+from geodelreg.fine.matching import match_pass, observe
+from geodelreg.fine.motions import layers
+from geodelreg.fine.overlay import overlay
+from geodelreg.fine.passes import Refinement
+from geodelreg.fine.survey import REACH_PX, Places, survey
+from geodelreg.fine.tone import single_band
+from geodelreg.fit.estimate import Observations
+from geodelreg.fit.field import FEWEST_POINTS, Field, fit_field
+from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
+from geodelreg.geo.affine import affine_matrix, apply_affine
+from geodelreg.judge.evidence import decimated
+from geodelreg.judge.verdict import Evidence
+from geodelreg.judge.words import lies, region
+from geodelreg.options import AlignOptions
+from geodelreg.pair import Pair
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Guess, Status
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
+from geodelreg.values.result import Accuracy
+
+_CALM_SHARE = 0.98
+"""Of the textured patches that agree, from which no part that matters can lie elsewhere."""
+_CALM_RESIDUAL = 0.3
+"""Of the largest residual allowed: what neighbours may share where no field need be fitted."""
+_PLACED_SCORE = 0.5
+_SURE_Z = 3.0
+_SURVEY_SIGMA_PX = 0.05
+_MOST_POINTS = 1000
+_PLACES = 200
+_VISIBLE = 3  # bands, as they are usually ordered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Whole:
+    """What all patches say about a correction, and not only those that agree.
+
+    Attributes
+    ----------
+    residual : Residual
+        What the correction leaves of the ground's smooth map, PAN pixels.
+    ground : (P,) bool
+        Patches of the last pass that are the ground's.
+    moved : float
+        Share of the textured patches that agree on another motion than the ground's.
+    words : str
+        Where they lie; empty where there are none.
+    clouds : float
+        Share of the patches that move and that clouds explain.
+    field : Field or None
+        The ground's smooth map, where the patches did not all agree.
+    """
+
+    residual: Residual
+    ground: BoolArray
+    moved: float = 0.0
+    words: str = ""
+    clouds: float = 0.0
+    field: Field | None = None
+
+    def is_bent(self, options: AlignOptions) -> bool:
+        """True when those that agree leave more of the ground's bend than is allowed."""
+        known = self.field is not None and not self.moved
+        return known and self.residual.low_px > options.max_residual_px
+
+    def status(self, last: StatusArray) -> StatusArray:
+        """Status of the patches of the last pass when all of the ground is heard."""
+        heard = np.where(self.ground, Status.KEPT, last).astype(np.uint8)
+        heard[~self.ground & (last == Status.KEPT)] = Status.CONSENSUS
+        return heard
+
+    def added_to(self, accuracy: Accuracy, evidence: Evidence) -> tuple[Accuracy, Evidence]:
+        """Both with what is known of the whole."""
+        left = self.residual
+        low_px = 0.0 if np.isnan(left.low_px) else left.low_px
+        accuracy = replace(
+            accuracy,
+            residual_rms_px=left.rms_px,
+            residual_p95_px=left.p95_px,
+            residual_interval_px=(left.low_px, left.high_px),
+        )
+        return accuracy, replace(
+            evidence, residual_low_px=low_px, moved=self.moved, words=self.words
+        )
+
+    def warnings(self, options: AlignOptions) -> tuple[str, ...]:
+        """What a user should be warned of that only all patches together show."""
+        notes: list[str] = []
+        left, most = self.residual, options.max_residual_px
+        if max(left.rms_px, left.high_px) > most:
+            notes.append(
+                f"{left.rms_px:.2g} PAN px RMS of the ground's bend are left (95 %: "
+                f"{left.low_px:.2g} to {left.high_px:.2g}), the limit is {most:g}: relief, a "
+                "moving sensor or dropped rows, which one affine does not follow"
+            )
+        if self.clouds:
+            notes.append(f"{self.clouds:.0%} of the patches move and look like clouds: left out")
+        return tuple(notes)
+
+    def under(self, pair: Pair, correction: PixelMap) -> Whole:
+        """The same of another correction."""
+        assert self.field is not None
+        return replace(self, residual=_left(pair, self.field, correction))
+
+
+def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Whole:
+    """Ask all patches, near and far, unless nearly all agree and neighbours share no residual.
+
+    Bright objects that were left out are asked too: not all that is bright is cloud.
+
+    Parameters
+    ----------
+    guess : Guess
+    refined : Refinement
+    correction : PixelMap
+        MS pixels to MS header pixels.
+    """
+    pair, last = refined.part.pair, refined.last
+    kept = last.status == Status.KEPT
+    some = last.points.take(kept)
+    gap = (correction.forward(some.source) - some.target) @ _in_pan(pair).T
+    near = shared_by_neighbours(some.source, gap)
+    textured = int((last.status != Status.TEXTURE).sum())
+    calm = near.high_px <= _CALM_RESIDUAL * pair.options.max_residual_px
+    if calm and not refined.dark_only and kept.sum() >= _CALM_SHARE * textured:
+        return Whole(near, np.asarray(kept))
+    return _surveyed(guess, refined, correction, Whole(near, np.asarray(kept)))
+
+
+def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
+    """Where every patch lies: the ground's, another motion's, or a cloud's."""
+    part = refined.part
+    template, _, surface = decimated(guess, refined, dark=False)
+    places = survey(overlay(part, template, surface, correction))
+    index = np.flatnonzero(_placed(places))
+    if len(index) < FEWEST_POINTS:
+        return _bent(refined, correction, agreed)
+    at, move = places.centre[index], places.move[index]
+    doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
+    ground = find_ground(at, at + move, doubt, places.brightness[index], places.roughness[index])
+    if ground.look.explains:
+        return replace(agreed, clouds=float((~ground.member).mean()))
+    to_full = ~part.template.grid.transform @ template.grid.transform
+    unit = float(np.sqrt(abs(to_full.determinant)))
+    unseen = refined.dark_only | (np.hypot(*move.T) * unit > MAX_MOVE * part.step)
+    far = ground.member & unseen
+    linear = affine_matrix(to_full)[:, :2] * _SURVEY_SIGMA_PX
+    there = part.to_surface(correction)
+    position, covariance = there.carry(
+        apply_affine(to_full, (at + move)[far]), np.tile(linear @ linear.T, (int(far.sum()), 1, 1))
+    )
+    none = np.zeros(len(position))
+    seen = Matched(
+        apply_affine(to_full, at[far]), position, covariance, none, none.astype(np.uint8)
+    )
+    whole = _bent(refined, correction, agreed, observe(part, seen, correction))
+    moved, words = _other_motion(refined, places, index, ground, unit)
+    if moved or whole.is_bent(part.pair.options):
+        height = _height(refined, correction)
+        if height is not None and height.explains:
+            return replace(agreed, clouds=height.share)
+    return replace(whole, moved=moved, words=words)
+
+
+def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
+    """Whether two visible bands contradict each other where patches move; None of one band."""
+    part, last = refined.part, refined.last
+    count = len(part.pair.source_bands)
+    if count < 2:
+        return None
+    options = MatchOptions(size=refined.size)
+    first, second = (
+        match_pass(
+            part,
+            refined.tiles,
+            correction,
+            replace(refined.tuning, tone=single_band(count, band), local_tone=False),
+            options,
+        )
+        for band in (0, min(count, _VISIBLE) - 1)
+    )
+    move, one, other = (
+        np.where(
+            np.isin(p.status, (Status.KEPT, *ELSEWHERE))[:, None],
+            p.points.target - correction.forward(p.points.source),
+            np.nan,
+        )
+        for p in (last, first, second)
+    )
+    difference = one - other
+    known = np.isfinite(difference).all(axis=1)
+    if not known.any():
+        return None
+    difference -= np.median(difference[known], axis=0)
+    variance = first.points.covariance + second.points.covariance
+    return height_parallax(move, difference, np.sqrt(variance.trace(axis1=1, axis2=2)))
+
+
+def _placed(places: Places) -> BoolArray:
+    """(P,) True for textured patches whose best place is theirs."""
+    near = np.hypot(*places.move.T) <= MAX_MOVE
+    sure = near | (places.z > _SURE_Z)
+    return np.asarray(places.textured & (places.score > _PLACED_SCORE) & sure)
+
+
+def _other_motion(
+    refined: Refinement, places: Places, index: IntArray, ground: Ground, unit: float
+) -> tuple[float, str]:
+    """Share of the textured patches with the largest other motion, and where they lie, in words."""
+    part, at, move = refined.part, places.centre[index], places.move[index]
+    apart = move - np.median(move[ground.member], axis=0)
+    textured = int(places.textured.sum())
+    looks = places.brightness[index], places.roughness[index]
+    motions = other_motions(at, apart, ground.label, *looks, textured, REACH_PX)
+    if not motions:
+        return 0.0, ""
+    motion = motions[0]
+    share = float(motion.member.sum()) / textured
+    size = places.centre.max(axis=0) + places.centre.min(axis=0)
+    step = motion.move * unit * part.pan_px_per_patch_px / part.step
+    return (
+        share,
+        f"{region(at, motion.member, size)} {lies(-step if part.ms_is_template else step)}",
+    )
+
+
+def _bent(
+    refined: Refinement, correction: PixelMap, agreed: Whole, far: Observations | None = None
+) -> Whole:
+    """The ground's smooth map through patches of the last pass, and those out of its reach."""
+    pair, last = refined.part.pair, refined.last
+    matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
+    points = last.points.take(matched)
+    if far is not None:
+        points = Observations(
+            np.concatenate([points.source, far.source]),
+            np.concatenate([points.target, far.target]),
+            np.concatenate([points.covariance, far.covariance]),
+        )
+    move = points.target - correction.forward(points.source)
+    sigma = np.sqrt(points.covariance.trace(axis1=1, axis2=2))
+    member = layers(points.source, move, sigma) == 0
+    some = np.flatnonzero(member)[:: 1 + int(member.sum()) // _MOST_POINTS]
+    if len(some) < FEWEST_POINTS or not np.ptp(points.source[some], axis=0).min() > 0:
+        return agreed
+    field = fit_field(points.take(some))
+    ground = np.zeros(len(last.status), dtype=np.bool_)
+    ground[matched] = member[: len(matched)]
+    return Whole(_left(pair, field, correction), ground, field=field)
+
+
+def _left(pair: Pair, field: Field, correction: PixelMap) -> Residual:
+    at = field.points.source
+    at = at[:: 1 + len(at) // _PLACES]
+    return residual_of(field, correction, at, _in_pan(pair))
+
+
+def _in_pan(pair: Pair) -> FloatArray:
+    """(2, 2) MS header pixels to PAN pixels."""
+    return np.asarray(pair.header.linearise(pair.source_centre)[0, :, :2])

@@ -1,0 +1,121 @@
+"""Pairs that one affine does not align are refused in words, or warned of; calm ones are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from affine import Affine
+from numpy.typing import NDArray
+
+import geodelreg
+from benchmarks.gate.bent_cases import BentPair
+from benchmarks.gate.distortions import Tear, waves
+from benchmarks.scenes.imagery import sample_imagery
+from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
+from geodelreg import Alignment, AlignOptions
+from geodelreg.errors import AlignmentRefusedError
+from geodelreg.product.check import check_dict
+from geodelreg.product.report import report_dict, report_schema
+from geodelreg.values.result import CheckOutcome
+
+SHAPE = (640, 640)
+SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=2.0)
+
+
+def still(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.zeros_like(xy)
+
+
+@dataclass(frozen=True)
+class Made:
+    """Two files, and what is true of them."""
+
+    ms: Path
+    pan: Path
+    pair: BentPair
+
+    def rms_px(self, transform: Affine) -> float:
+        return float(np.sqrt((self.pair.errors(transform) ** 2).sum(axis=1).mean()))
+
+
+def made(folder: Path, bend: Bend) -> Made:
+    scene = make_scene(SPEC, sample_imagery(), bend)
+    write_scene(scene, folder)
+    return Made(folder / "ms.tif", folder / "pan.tif", BentPair(scene, bend))
+
+
+@pytest.fixture(scope="module")
+def wavy(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return made(tmp_path_factory.mktemp("wavy"), waves(2.0, 400.0, np.random.default_rng(0)))
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return made(tmp_path_factory.mktemp("torn"), Tear((16.0, -12.0), 0.4, 0.0, SHAPE))
+
+
+def refusal(of: Made, **options: object) -> tuple[AlignmentRefusedError, Alignment]:
+    with pytest.raises(AlignmentRefusedError) as caught:
+        geodelreg.align(of.ms, of.pan, AlignOptions(**options))  # type: ignore[arg-type]
+    assert caught.value.alignment is not None
+    return caught.value, caught.value.alignment
+
+
+def failed(alignment: Alignment) -> set[str]:
+    return {reason.name for reason in alignment.verdict.reasons if not reason.passed}
+
+
+def test_waves_are_refused_with_what_they_leave_and_what_helps(wavy: Made) -> None:
+    error, alignment = refusal(wavy)
+    assert failed(alignment) == {"local"}
+    assert "--on-local warn" in error.remedy
+    assert "--max-residual" in error.remedy
+    accuracy, true = alignment.accuracy, wavy.rms_px(wavy.pair.best_affine())
+    assert accuracy.residual_rms_px == pytest.approx(true, rel=0.15)
+    low, high = accuracy.residual_interval_px
+    assert 0.5 < low <= accuracy.residual_rms_px <= high
+    assert accuracy.residual_p95_px > accuracy.residual_rms_px
+    jsonschema.validate(report_dict(alignment), report_schema())
+
+
+def test_waves_are_written_when_told_by_the_best_affine_of_the_whole(
+    wavy: Made, tmp_path: Path
+) -> None:
+    alignment = geodelreg.align(wavy.ms, wavy.pan, AlignOptions(on_local="warn"))
+    assert any("of the ground's bend" in warning for warning in alignment.warnings)
+    geodelreg.write(alignment, tmp_path / "out.tif")
+    best = wavy.rms_px(wavy.pair.best_affine())
+    assert wavy.rms_px(alignment.correction.corrected) < 1.1 * best
+
+
+def test_the_limit_of_the_residual_is_the_users(wavy: Made) -> None:
+    alignment = geodelreg.align(wavy.ms, wavy.pan, AlignOptions(max_residual_px=5.0))
+    assert alignment.verdict.accepted
+
+
+def test_a_second_motion_is_refused_and_its_place_is_told(torn: Made) -> None:
+    error, alignment = refusal(torn, on_local="warn")
+    assert failed(alignment) == {"two_motions"}
+    assert "16 px left and 12 px down of the rest" in str(error)
+    assert "the lower 4" in str(error)
+    assert "--mask" in error.remedy
+
+
+def test_check_calls_both_misaligned(wavy: Made, torn: Made) -> None:
+    for of in (wavy, torn):
+        found = geodelreg.check(of.ms, of.pan)
+        assert found.outcome is CheckOutcome.MISALIGNED
+        jsonschema.validate(check_dict(found), report_schema())
+    assert "16 px left and 12 px down of the rest" in found.reason
+
+
+def test_where_one_affine_is_the_truth_hardly_anything_is_left(tmp_path: Path) -> None:
+    plain = made(tmp_path, still)
+    alignment = geodelreg.align(plain.ms, plain.pan)
+    assert plain.rms_px(alignment.correction.corrected) < 0.1
+    low, high = alignment.accuracy.residual_interval_px
+    assert low <= alignment.accuracy.residual_rms_px <= high < 0.15
