@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
 _OFTEN = 0.7
 """Probability from which patches that move count as brighter, or smoother: 0.75 to 0.89 over clouds
@@ -17,8 +17,9 @@ _STILL = 0.65
 _PARALLAX_R2 = 0.65
 """Share of the motion that the bands' parallax must explain: 0.74 and 0.96 over real clouds, 0.43
 at most over ground, where unlike bands look different."""
-_NO_PARALLAX_SIGMAS = 2.5
-_FEWEST = 30
+_NO_PARALLAX_SIGMAS = 2.5  # unexplained: ablate
+_MOST_PERCENT = 95  # unexplained: ablate
+_FEWEST = 30  # unexplained: ablate
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +141,7 @@ def height_parallax(
 def _along(values: FloatArray) -> FloatArray:
     """(N,) components along the direction in which (N, 2) values spread most, outliers bounded."""
     centred = values - np.median(values, axis=0)
-    far = np.percentile(np.hypot(*centred.T), 95)
-    size = np.maximum(np.hypot(*centred.T), 1e-12)
+    far = np.percentile(np.hypot(*centred.T), _MOST_PERCENT)
+    size = np.maximum(np.hypot(*centred.T), TINY)
     centred = centred * np.minimum(far / size, 1.0)[:, None]
     return np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, 1])

@@ -11,22 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.values.raster import BoolArray, FloatArray, IntArray
+from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 MOST_STRAIN = 0.04
 """Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
-LEAST_SHARE = 0.05
-LEAST_PATCHES = 8
+LEAST_SHARE = 0.05  # unexplained: ablate
+LEAST_PATCHES = 8  # unexplained: ablate
 _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
-_SOLID = 0.9
-_ROUNDING_PX = 1e-6
+_SOLID = 0.9  # unexplained: ablate
+_ROUNDING_PX = 1e-6  # unexplained: ablate
 _CORE = 0.75
 """Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
 those astride a tear fit to both sides a little, and to neither well."""
 _MEDIAN_GAP = math.sqrt(4.0 * math.log(2.0) / 2.0)
 """Median distance of two points of unit radial standard error (Rayleigh's distribution)."""
-_NOISE_SIGMAS = 2.5
+_NOISE_SIGMAS = 2.5  # unexplained: ablate
 _SLIVER = 0.2
 """Altitude over longest side below which a triangle joins places along the hull, no neighbours."""
 
@@ -158,7 +158,7 @@ def second_motion(
     share = min((radius_px / reach_px) ** 2, 1.0)
     # one of the members gave the place, so one less speaks for it
     tail = float(bdtrc(count - 2, total - 1, share)) if count > 1 else 1.0
-    log_nfa = math.log10(total) + math.log10(max(tail, 1e-300))
+    log_nfa = math.log10(total) + math.log10(max(tail, TINY))
     if log_nfa > math.log10(_CHANCE):
         return None
     member = np.zeros(len(move), dtype=bool)

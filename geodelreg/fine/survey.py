@@ -12,14 +12,20 @@ import cv2
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
-from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
+from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
 
 REACH_PX = 22
 """Of the search; with patches of 20 pixels the windows measure 64."""
 
-_LEAST_VALID = 0.8
+_PATCH_PX = 20  # unexplained: ablate
+_COLUMNS = 9  # of what is noted of a patch, below
+_LAPLACE = 6  # the norm of its kernel (Immerkær 1996)
+_LAPLACE2 = 20  # the sum of squares of the kernel of second differences
+_MOST_R = 0.999  # below 1, where Fisher's transformation ends
+_ROUNDED_R = 1.001  # above 1 by rounding; what lies beyond is flat
+_LEAST_VALID = 0.8  # unexplained: ablate
 _CORRELATION_LENGTH_PX = 2.0
-_NOISE_SHARE = 0.6745
+_NOISE_SHARE = 0.6745  # unexplained: ablate
 _LARGEST_SIGMA_PX = 0.5
 
 
@@ -58,12 +64,12 @@ class Places:
     def z(self) -> FloatArray:
         """(P,) by how many standard errors the best place correlates better (Fisher 1915)."""
         independent = (self.size / _CORRELATION_LENGTH_PX) ** 2 - 3
-        there, here = (np.arctanh(np.minimum(r, 0.999)) for r in (self.score, self.here))
+        there, here = (np.arctanh(np.minimum(r, _MOST_R)) for r in (self.score, self.here))
         better = there - here
         return np.asarray(better * np.sqrt(independent / 2))
 
 
-def survey(overlay: Overlay, size: int = 20, reach: int = REACH_PX) -> Places:
+def survey(overlay: Overlay, size: int = _PATCH_PX, reach: int = REACH_PX) -> Places:
     """Correlate every patch with all places up to `reach` pixels away.
 
     Parameters
@@ -89,7 +95,7 @@ def survey(overlay: Overlay, size: int = 20, reach: int = REACH_PX) -> Places:
             patch = template[mine]
             window = padded[top : top + size + 2 * reach, left : left + size + 2 * reach]
             scores = np.abs(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
-            scores[~np.isfinite(scores) | (scores > 1.0 + 1e-3)] = 0.0
+            scores[~np.isfinite(scores) | (scores > _ROUNDED_R)] = 0.0
             row, column = np.unravel_index(int(scores.argmax()), scores.shape)
             move = _peak(scores, int(row), int(column)) - reach
             rows.append(
@@ -100,7 +106,7 @@ def survey(overlay: Overlay, size: int = 20, reach: int = REACH_PX) -> Places:
                     *(_sigma(patch, noise), float(patch.mean()), _roughness(patch)),
                 ]
             )
-    found = np.array(rows).reshape(-1, 9)
+    found = np.array(rows).reshape(-1, _COLUMNS)
     centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
     score, here, sigma, brightness, roughness = rest
     return Places(centre, move, score, here, sigma < _LARGEST_SIGMA_PX, brightness, roughness, size)
@@ -114,7 +120,7 @@ def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:
 
 def _noise(image: Float32Array, valid: BoolArray) -> float:
     """Standard deviation of the pixels' noise, at most (Immerkær 1996, by the median)."""
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / _LAPLACE
     rough = np.abs(cv2.filter2D(image, cv2.CV_32F, kernel))[valid]
     return float(np.median(rough)) / _NOISE_SHARE if len(rough) else 0.0
 
@@ -132,8 +138,8 @@ def _roughness(patch: Float32Array) -> float:
     """Of neighbouring pixels' second differences to the whole patch, standard deviations."""
     inner = patch[1:-1, 1:-1]
     around = patch[:-2, 1:-1] + patch[2:, 1:-1] + patch[1:-1, :-2] + patch[1:-1, 2:]
-    fine = float(np.sqrt(np.mean((4 * inner - around) ** 2) / 20))
-    return fine / max(float(patch.std()), 1e-12)
+    fine = float(np.sqrt(np.mean((4 * inner - around) ** 2) / _LAPLACE2))
+    return fine / max(float(patch.std()), TINY)
 
 
 def _peak(scores: Float32Array, row: int, column: int) -> FloatArray:

@@ -20,14 +20,19 @@ FEWEST_POINTS = 12
 """Twice the parameters of the trend of both axes: fewer leave nothing to tell noise by."""
 MOST_STRAIN = 0.04
 """Of a field that is believed: relief seen at 20° bends by less, a fold by much more."""
-_STUDENT_DOF = 6.0
-_REJECT_D2 = 25.0
+_STUDENT_DOF = 6.0  # unexplained: ablate
+_REJECT_D2 = 25.0  # unexplained: ablate
 _ROUNDS = 3
-_TUNING_POINTS = 200
-_LEAST_VARIANCE_PX2 = 1e-8
-_JITTER = 1e-9
-_AT_ONCE = 20_000
-_IMPOSSIBLE = 1e12
+_TUNING_POINTS = 200  # unexplained: ablate
+_LEAST_VARIANCE_PX2 = 1e-8  # unexplained: ablate
+_JITTER = 1e-9  # unexplained: ablate
+_AT_ONCE = 20_000  # unexplained: ablate
+_IMPOSSIBLE = 1e12  # unexplained: ablate
+_LEAST_NUGGET_PX2 = 1e-7  # unexplained: ablate
+_STEPS = 20  # unexplained: ablate
+_CLOSE = 1e-6  # relative; unexplained: ablate
+_STEP = 1e-3  # of a logarithm; unexplained: ablate
+_MATERN = 5.0  # twice the order 5/2
 _DIGITS = 2  # of the logarithms of a kernel: a percent, far below what points tell of it
 
 
@@ -51,7 +56,7 @@ class Kernel:
 
     def correlation(self, distance_px: FloatArray) -> FloatArray:
         """Of the residual at places so far apart."""
-        scaled = np.sqrt(5.0) / self.range_px * distance_px
+        scaled = np.sqrt(_MATERN) / self.range_px * distance_px
         return np.asarray((1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled))
 
 
@@ -255,7 +260,9 @@ def _first_guess(points: Observations) -> Kernel:
     left = move - columns @ np.linalg.lstsq(columns, move, rcond=None)[0]
     variance = np.maximum(left.var(axis=0), _LEAST_VARIANCE_PX2)
     noise = float(np.median(points.covariance.trace(axis1=1, axis2=2))) / 2
-    return Kernel(4 * spacing, (float(variance[0]), float(variance[1])), max(noise, 1e-7))
+    return Kernel(
+        4 * spacing, (float(variance[0]), float(variance[1])), max(noise, _LEAST_NUGGET_PX2)
+    )
 
 
 def _spacing(points: Observations) -> float:
@@ -300,6 +307,6 @@ def _tuned(field: Field) -> Kernel:
     found = minimize(
         cost,
         np.clip(start, low, high), method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": 20, "ftol": 1e-6, "eps": 1e-3},
+        options={"maxiter": _STEPS, "ftol": _CLOSE, "eps": _STEP},
     )  # fmt: skip
     return kernel(np.round(found.x, _DIGITS))

@@ -11,11 +11,12 @@ from geodelreg.fit.field import Field
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, FloatArray
 
-_DRAWS = 400
-_ENDS = (2.5, 97.5)
-_FEWEST = 30
+_DRAWS = 400  # unexplained: ablate
+_ENDS = (2.5, 97.5)  # unexplained: ablate
+_P95 = 95  # percent, as the name says
+_FEWEST = 30  # unexplained: ablate
 _DIGITS = 9  # what the number of BLAS threads changes lies far below
-_BOUND = 6.0
+_BOUND = 6.0  # unexplained: ablate
 _P95_OVER_RMS = math.sqrt(math.log(20.0))
 """Of distances in the plane whose components are normal (Rayleigh's distribution)."""
 
@@ -71,7 +72,7 @@ def residual_of(
     unknown = float(((scale**2) @ covariance.diagonal(axis1=1, axis2=2)).sum(axis=0).mean())
     low2, high2 = np.percentile(distance2.mean(axis=0), _ENDS)
     rms = math.sqrt(float(((gap @ scale.T) ** 2).sum(axis=1).mean()))
-    p95 = float(np.percentile(np.hypot(*(gap @ scale.T).T), 95))
+    p95 = float(np.percentile(np.hypot(*(gap @ scale.T).T), _P95))
     low, high = math.sqrt(max(float(low2) - unknown, 0.0)), math.sqrt(float(high2))
     return Residual(*(round(value, _DIGITS) for value in (rms, p95, low, high)))
 

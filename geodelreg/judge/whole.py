@@ -36,9 +36,9 @@ _CALM_RESIDUAL = 0.3
 """Of the largest residual allowed: what neighbours may share where no field need be fitted."""
 _PLACED_SCORE = 0.5
 _SURE_Z = 3.0
-_SURVEY_SIGMA_PX = 0.05
-_MOST_POINTS = 1000
-_PLACES = 200
+_SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
+_MOST_POINTS = 1000  # unexplained: ablate
+_PLACES = 200  # unexplained: ablate
 _VISIBLE = 3  # bands, as they are usually ordered
 
 

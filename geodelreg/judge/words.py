@@ -13,6 +13,7 @@ from geodelreg.values.result import Verdict
 
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
+_MOSTLY = 0.9  # unexplained: ablate
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
 
@@ -102,7 +103,7 @@ def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
     size : (float, float)
         Width and height of the raster, in the same pixels.
     """
-    share = f"{100 * member.mean():.0f} %"
+    share = f"{member.mean():.0%}".replace("%", " %")
     if not member.any():
         return "nowhere"
     best, name = 0.0, ""
@@ -112,7 +113,7 @@ def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
             inside = member[ends[: int(member.sum())]].mean()
             if inside > best:
                 best, name = float(inside), word
-    if best >= 0.9:
+    if best >= _MOSTLY:
         return f"the {name} {share}"
     x, y = xy[member].mean(axis=0) / size
     across = ("left", "middle", "right")[min(int(3 * x), 2)]

@@ -16,7 +16,8 @@ from rasterio.enums import Resampling
 from scipy import ndimage
 
 from geodelreg import AlignOptions, align, check
-from geodelreg.values.result import Outcome
+from geodelreg.errors import AlignmentRefusedError
+from geodelreg.values.result import CheckOutcome, Outcome
 from tests.integration.align_scenes import (
     Pixels,
     Recipe,
@@ -170,7 +171,7 @@ def test_undeclared_frames_do_not_lead(tmp_path: Path) -> None:
 
 
 def test_relief_is_not_passed_over_in_silence(tmp_path: Path) -> None:
-    """Parallax moves patches along one direction; some agree by chance, and all others say so."""
+    """Parallax bends MS by 1.2 PAN px RMS: no affine is written, and `check` says misaligned."""
 
     def parallax(ms: Pixels, _: Pixels) -> None:
         height = ndimage.gaussian_filter(np.random.default_rng(2).normal(size=ms.shape[1:]), 18)
@@ -180,9 +181,14 @@ def test_relief_is_not_passed_over_in_silence(tmp_path: Path) -> None:
             band[:] = ndimage.map_coordinates(band, places, mode="reflect").clip(0, 4095)
 
     scene = make_scene(tmp_path, replace(STANDARD, change=parallax))
-    alignment = align(scene.ms, scene.pan)
-    assert any("lie elsewhere" in warning for warning in alignment.warnings)
-    assert check(scene.ms, scene.pan).affine_enough is not True
+    with pytest.raises(AlignmentRefusedError) as refused:
+        align(scene.ms, scene.pan)
+    assert refused.value.alignment is not None
+    reasons = refused.value.alignment.verdict.reasons
+    assert [reason.name for reason in reasons if not reason.passed] == ["local"]
+    found = check(scene.ms, scene.pan)
+    assert found.outcome is not CheckOutcome.ALIGNED
+    assert found.affine_enough is not True
 
 
 def test_as_many_keypoints_are_taken_as_are_allowed(tmp_path: Path) -> None:
