@@ -248,7 +248,7 @@ def spilled(folder: Path, target: str) -> Path:
 def test_hfa_reads_pixels_in_its_own_folder_only(folder: Path) -> None:
     read_all(spilled(folder, "aaaaaaaaaa.ige"))
     with pytest.raises(RasterUnreadableError, match=r"x\.tif"):
-        read_all(spilled(folder, "c:/work/be.ige"))  # where it was made, and not here
+        read_all(spilled(folder, "c:/data/be.ige"))  # where it was made, and not here
     (folder / "aaaaaaaaaa.ige").rename(folder.parent / "secrets.ige")
     path = spilled(folder, "../secrets.ige")
     for given in (path, vrt(folder / "a.vrt", SOURCE.format(path))):
