@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from geodelreg.errors import GeodelregError
 from geodelreg.values.result import Alignment
 from geodelreg.version import __version__
 
@@ -105,13 +106,14 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
 
 def written_tags(path: Path) -> dict[str, str]:
     """``GEODELREG_*`` tags that a raster carries; none when it is no raster of geodelreg's."""
-    import rasterio
     from rasterio.errors import RasterioError
 
+    from geodelreg.door.opening import open_raster
+
     try:
-        with rasterio.open(path) as dataset:
+        with open_raster(path) as dataset:
             tags = dataset.tags()
-    except RasterioError:
+    except (RasterioError, GeodelregError):
         return {}
     return {name: text for name, text in tags.items() if name.startswith("GEODELREG_")}
 
