@@ -11,17 +11,19 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 from affine import Affine
-from numpy.typing import NDArray
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import NoOverlapError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
+from geodelreg.geo.grid import outline
 from geodelreg.product.header import Provenance
 from geodelreg.product.view import corrected_view
 from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction
+
+_EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRSs are curved
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,9 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
         return grid
     low, high = np.zeros(2), np.array(pan.shape[::-1], dtype=np.float64)
     for path, correction in what.sources:
-        edge = apply_affine(correction.corrected, _outline(path))
+        with open_raster(path) as dataset:
+            own = Grid(correction.corrected, dataset.shape, correction.crs_wkt)
+        edge = apply_affine(own.transform, outline(own, _EDGE_PLACES))
         ground = map_points(edge, correction.crs_wkt, grid.crs_wkt)
         seen = apply_affine(~pan.transform, ground)
         seen = seen[np.isfinite(seen).all(axis=1)]
@@ -67,16 +71,6 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     width, height = (int(n) for n in last - first)
     moved = pan.transform @ Affine.translation(*map(float, first))
     return Grid(moved, (height, width), grid.crs_wkt)
-
-
-def _outline(path: Path) -> NDArray[np.float64]:
-    """(64, 2) pixels along the edges of a raster."""
-    with open_raster(path) as dataset:
-        width, height = dataset.width, dataset.height
-    t = np.linspace(0.0, 1.0, 16)
-    sides = [(t * width, 0 * t), (t * width, 0 * t + height), (0 * t, t * height)]
-    sides.append((0 * t + width, t * height))
-    return np.concatenate([np.stack(side, axis=1) for side in sides])
 
 
 @contextmanager
