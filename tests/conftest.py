@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,25 @@ UTM16 = "EPSG:32616"
 TRANSFORM = Affine(30.0, 0.0, 500_000.0, 0.0, -30.0, 1_400_000.0)
 
 WriteRaster = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def _process_as_found() -> Iterator[None]:
+    """Undo what a command run in this process leaves to it: variables and levels of logging.
+
+    The command line owns its process and sets both for good; in a test the next one would find
+    the network closed to GDAL, or the log silent.
+    """
+    environment = dict(os.environ)
+    loggers = [logging.getLogger(name) for name in (None, "geodelreg", "geodelreg_cli")]
+    before = [(one, one.level, list(one.handlers)) for one in loggers]
+    yield
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    os.environ.update(environment)
+    for one, level, handlers in before:
+        one.setLevel(level)
+        one.handlers = handlers
 
 
 @pytest.fixture
