@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from geodelreg.door.names import as_path
+from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
+from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.reader import check_band, open_raster
 from geodelreg.options import PansharpenOptions, check_header_holds
 from geodelreg.pair import Progress
-from geodelreg.product.common_grid import Sharpening
+from geodelreg.product.atomic import together
+from geodelreg.product.common_grid import Sharpening, SpectralFile
 from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.values.result import Alignment, Correction
-from geodelreg.writing import AnyPath, correction_of_file, paths_of
+from geodelreg.writing import AnyPath, correction_of_file, input_paths, masks_of, paths_of
 
 
 def pansharpen(
@@ -60,26 +63,26 @@ def pansharpen(
     if alignment is not None:
         check_header_holds(alignment.options.model)
     paths = [as_path(path) for path in paths_of(source)]
-    placed = [
-        (
-            path,
-            _as_it_is(path, allow) if alignment is None else correction_of_file(alignment, path)[0],
-        )
-        for path in paths
-    ]
-    with open_raster(reference, allow=allow) as pan:
-        check_band(pan, pan_band)
-    bands = spectral_bands(paths, options.given_bands())
-    what = Sharpening(placed, Path(reference), pan_band, bands)
-    weights = _weights(what, options)
-    tags = {} if alignment is None else provenance_tags(alignment)
-    write_pansharpened(what, Path(target), weights, tags, options, progress)
+    masks = () if alignment is None else masks_of(alignment)
+    names = [*map(str, paths), str(reference), *masks]
+    with allowing(allow), together([Path(target)], lambda: input_paths(names, allow)):
+        with open_raster(reference, allow=allow) as pan:
+            check_band(pan, pan_band)
+        files = [_spectral_file(path, alignment, allow) for path in paths]
+        bands = spectral_bands(files, options.given_bands())
+        what = Sharpening(files, Path(reference), pan_band, bands)
+        weights = _weights(what, options)
+        tags = {} if alignment is None else provenance_tags(alignment)
+        write_pansharpened(what, Path(target), weights, tags, options, progress)
 
 
-def _as_it_is(path: Path, allow: str) -> Correction:
-    with open_raster(path, allow=allow) as reader:
-        grid = reader.grid
-    return Correction("none", grid.crs_wkt, grid.transform, grid.transform)
+def _spectral_file(path: Path, alignment: Alignment | None, allow: str) -> SpectralFile:
+    with open_dataset(str(path), allow=allow) as dataset:
+        if alignment is not None:
+            return SpectralFile.of(path, dataset, correction_of_file(alignment, path)[0])
+        grid = dataset_grid(str(path), dataset)
+        as_it_is = Correction("none", grid.crs_wkt, grid.transform, grid.transform)
+        return SpectralFile.of(path, dataset, as_it_is)
 
 
 def _weights(what: Sharpening, options: PansharpenOptions) -> list[float]:

@@ -178,10 +178,14 @@ def input_paths(names: Iterable[str], allow: str) -> list[Path]:
 
 
 def _inputs(alignment: Alignment) -> list[Path]:
+    names = [*alignment.source.paths, alignment.reference.paths[0], *masks_of(alignment)]
+    return input_paths(names, alignment.options.allow)
+
+
+def masks_of(alignment: Alignment) -> list[str]:
+    """Files of the masks that an alignment was told of."""
     options = alignment.options
-    masks = [parse_mask(mask).path for mask in (*options.masks, *options.pan_masks)]
-    names = [*alignment.source.paths, alignment.reference.paths[0], *masks]
-    return input_paths(names, options.allow)
+    return [parse_mask(mask).path for mask in (*options.masks, *options.pan_masks)]
 
 
 @contextmanager

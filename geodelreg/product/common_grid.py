@@ -17,6 +17,7 @@ from geodelreg.errors import NoOverlapError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.grid import outline
+from geodelreg.product import metadata
 from geodelreg.product.header import Provenance
 from geodelreg.product.view import corrected_view
 from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
@@ -27,13 +28,48 @@ _EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRS
 
 
 @dataclass(frozen=True, slots=True)
+class SpectralFile:
+    """An MS file, as it was when it was opened.
+
+    Attributes
+    ----------
+    path : Path
+    correction : Correction
+        Where its pixels lie.
+    shape : tuple of int
+        ``(height, width)`` in pixels.
+    bands : sequence of int
+        Numbers of the spectral bands, from 1; alpha is none.
+    names : sequence of (str or None)
+        Of all its bands.
+    nodata : float or None
+    """
+
+    path: Path
+    correction: Correction
+    shape: tuple[int, int]
+    bands: Sequence[int]
+    names: Sequence[str | None]
+    nodata: float | None
+
+    @classmethod
+    def of(cls, path: Path, dataset: Any, correction: Correction) -> SpectralFile:
+        """What must be known of an open file."""
+        from rasterio.enums import ColorInterp
+
+        meanings = zip(dataset.indexes, dataset.colorinterp, strict=True)
+        bands = [band for band, meaning in meanings if meaning is not ColorInterp.alpha]
+        names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
+        return cls(path, correction, dataset.shape, bands, names, dataset.nodata)
+
+
+@dataclass(frozen=True, slots=True)
 class Sharpening:
     """What is sharpened with what.
 
     Attributes
     ----------
-    sources : sequence of (Path, Correction)
-        MS files and where their pixels lie.
+    sources : sequence of SpectralFile
     reference : Path
     pan_band : int
         Band of `reference`, from 1.
@@ -41,7 +77,7 @@ class Sharpening:
         The spectral bands: number of the file, from 0, and of the band in it, from 1.
     """
 
-    sources: Sequence[tuple[Path, Correction]]
+    sources: Sequence[SpectralFile]
     reference: Path
     pan_band: int
     bands: Sequence[tuple[int, int]]
@@ -53,11 +89,10 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     if extent == "pan":
         return grid
     low, high = np.zeros(2), np.array(pan.shape[::-1], dtype=np.float64)
-    for path, correction in what.sources:
-        with open_raster(path) as dataset:
-            own = Grid(correction.corrected, dataset.shape, correction.crs_wkt)
+    for file in what.sources:
+        own = Grid(file.correction.corrected, file.shape, file.correction.crs_wkt)
         edge = apply_affine(own.transform, outline(own, _EDGE_PLACES))
-        ground = map_points(edge, correction.crs_wkt, grid.crs_wkt)
+        ground = map_points(edge, own.crs_wkt, grid.crs_wkt)
         seen = apply_affine(~pan.transform, ground)
         seen = seen[np.isfinite(seen).all(axis=1)]
         if len(seen):
@@ -65,7 +100,7 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     first, last = np.floor(low + TOLERANCE_PX), np.ceil(high - TOLERANCE_PX)
     if (last <= first).any():
         raise NoOverlapError(
-            f"{what.sources[0][0]} and {what.reference} share no ground",
+            f"{what.sources[0].path} and {what.reference} share no ground",
             "Check that both show the same place, or use --extent pan.",
         )
     width, height = (int(n) for n in last - first)
@@ -78,8 +113,9 @@ def on_grid(what: Sharpening, grid: Grid, resampling: str) -> Iterator[list[Any]
     """The MS files, where their corrections put them, resampled onto a grid when read."""
     with ExitStack() as stack:
         files = []
-        for path, correction in what.sources:
-            view = corrected_view(path, Provenance(correction, (), {}), mask_rules=True)
+        for file in what.sources:
+            content = Provenance(file.correction, (), {})
+            view = corrected_view(file.path, content, mask_rules=True)
             name, _ = stack.enter_context(view)
             dataset = stack.enter_context(open_raster(name))
             warped = warped_onto(dataset, grid, Validity.of(dataset), resampling)
@@ -119,7 +155,7 @@ def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recip
     with on_grid(what, grid, resampling) as warped:
         for number, (path, lazy) in enumerate(zip(files, warped, strict=True)):
             rasterio.shutil.copy(lazy, path, driver="VRT")
-            _name_source(path, what.sources[number][0])
+            _name_source(path, what.sources[number].path)
             used = [band for file, band in what.bands if file == number]
             covers += [(path, band) for band in (used if lazy.nodata is not None else used[:1])]
     pan = (what.reference, what.pan_band)

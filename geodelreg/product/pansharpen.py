@@ -24,19 +24,18 @@ from numpy.typing import NDArray
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import UsageError
 from geodelreg.options import PansharpenOptions
-from geodelreg.product import metadata, sidecars
+from geodelreg.product import sidecars
 from geodelreg.product.atomic import staged
 from geodelreg.product.common_grid import (
     Recipe,
     Sharpening,
+    SpectralFile,
     on_grid,
     recipe_of,
     target_grid,
 )
 from geodelreg.product.environment import gdal_session
-from geodelreg.product.geotiff import check_source
 from geodelreg.product.rewrite import gdal_write, output_driver, user_creation
-from geodelreg.product.targets import check_not_input
 from geodelreg.product.warp import Validity, warped_onto
 from geodelreg.values.raster import Float32Array, Grid
 
@@ -48,26 +47,17 @@ _SAMPLE_SIDE = 300
 Progress = Callable[[float, str], None]
 
 
-def spectral_bands(paths: Sequence[Path], chosen: Sequence[int]) -> list[tuple[int, int]]:
+def spectral_bands(files: Sequence[SpectralFile], chosen: Sequence[int]) -> list[tuple[int, int]]:
     """Number of the file and of the band for bands counted through all files, from 1.
 
-    Alpha bands are no spectral bands; without `chosen` all others are taken.
+    Without `chosen` all are taken.
 
     Raises
     ------
     UsageError
-        A band that does not exist, or is none.
+        A band that does not exist.
     """
-    from rasterio.enums import ColorInterp
-
-    found: list[tuple[int, int]] = []
-    for number, path in enumerate(paths):
-        with open_raster(path) as dataset:
-            found += [
-                (number, band)
-                for band, meaning in zip(dataset.indexes, dataset.colorinterp, strict=True)
-                if meaning is not ColorInterp.alpha
-            ]
+    found = [(number, band) for number, file in enumerate(files) for band in file.bands]
     if any(not 1 <= number <= len(found) for number in chosen):
         raise UsageError(
             f"bands = {list(chosen)} are not all among the {len(found)} bands of MS",
@@ -133,11 +123,7 @@ def write_pansharpened(
     """
     import rasterio
 
-    paths = [path for path, _ in what.sources]
-    check_not_input(target, [*paths, what.reference])
     with gdal_session(what.reference):
-        for path in (*paths, what.reference):
-            check_source(path)
         driver = output_driver(target, options.driver)
         if driver not in ("GTiff", "COG", "VRT"):
             raise UsageError(
@@ -146,7 +132,7 @@ def write_pansharpened(
             )
         with open_raster(what.reference) as pan:
             grid = target_grid(what, pan, options.extent)
-        stale = sidecars.stale_beside(Path(os.path.realpath(target)), paths[0])
+        stale = sidecars.stale_beside(Path(os.path.realpath(target)), what.sources[0].path)
         with staged(target, overwrite=options.overwrite, stale=stale) as out:
             if driver == "VRT":
                 _write_vrt(what, out, target, grid, weights, tags, options)
@@ -191,7 +177,7 @@ def _pansharpened_xml(
         "<AlgorithmOptions><Weights>",
         ",".join(repr(float(weight)) for weight in weights),
         "</Weights></AlgorithmOptions>",
-        "<Resampling>Nearest</Resampling><NumThreads>ALL_CPUS</NumThreads>",
+        "<Resampling>Nearest</Resampling>",
         depth,
         f"<PanchroBand>{_source_xml(*recipe.pan, recipe.folder)}</PanchroBand>",
     ]
@@ -272,16 +258,9 @@ def _make_relative(vrt: Path, folder: Path) -> None:
 
 
 def _descriptions(what: Sharpening) -> list[str | None]:
-
-    found: list[tuple[str | None, ...]] = []
-    for path, _ in what.sources:
-        with open_raster(path) as dataset:
-            found.append(metadata.attribute(dataset, "descriptions") or (None,) * dataset.count)
     single = len(what.sources) > 1
-    return [
-        found[file][band - 1] or (what.sources[file][0].stem if single else None)
-        for file, band in what.bands
-    ]
+    chosen = [(what.sources[file], band) for file, band in what.bands]
+    return [file.names[band - 1] or (file.path.stem if single else None) for file, band in chosen]
 
 
 def _write_tiff(
@@ -326,8 +305,7 @@ def _write_tiff(
 
 def _declared_nodata(what: Sharpening, sharp: Any) -> float | None:
     """No-data value of the first MS file, if the sharpened type can hold it."""
-    with open_raster(what.sources[0][0]) as dataset:
-        nodata = dataset.nodata
+    nodata = what.sources[0].nodata
     if nodata is None:
         return None
     kind = np.dtype(sharp.dtypes[0])

@@ -304,7 +304,6 @@ def warped_onto(view: Any, grid: Grid, validity: Validity, resampling: str) -> I
         resampling=Resampling[_RASTERIO_NAMES.get(resampling, resampling)],
         tolerance=TOLERANCE_PX,
         UNIFIED_SRC_NODATA="PARTIAL",  # each band has its own gaps
-        NUM_THREADS=os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
         **settings,
     ) as warped:
         yield warped

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 import geodelreg
 from geodelreg import PansharpenOptions
 from geodelreg.errors import NoOverlapError, OutputIsInputError, UsageError
+from geodelreg.product.atomic import together
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_tiles"
 UTM = "EPSG:32618"
@@ -266,3 +268,44 @@ def test_inputs_stay_and_ground_must_be_shared(tmp_path: Path) -> None:
         geodelreg.pansharpen(
             far, pan, tmp_path / "sharp.tif", PansharpenOptions(extent="intersection")
         )
+
+
+@pytest.mark.parametrize("name", ["part.tif", "part.tif.ovr", "ms.vrt.msk", "pan.tif.aux.xml"])
+def test_whatever_the_inputs_consist_of_stays(tmp_path: Path, name: str) -> None:
+    pan = flat_pan(tmp_path, 60, 60)
+    ramps(tmp_path, 2, (0.0, 0.0)).rename(tmp_path / "part.tif")
+    rasterio.shutil.copy(tmp_path / "part.tif", tmp_path / "ms.vrt", driver="VRT")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    options = PansharpenOptions(overwrite=True, driver="GTiff")
+    with pytest.raises(OutputIsInputError):
+        geodelreg.pansharpen(tmp_path / "ms.vrt", pan, tmp_path / name, options)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_virtual_raster_beside_the_output_that_is_an_input_stays(tmp_path: Path) -> None:
+    ms, pan = ramps(tmp_path, 2, (0.0, 0.0)), flat_pan(tmp_path, 60, 60)
+    geodelreg.pansharpen(ms, pan, tmp_path / "one.vrt")
+    part = (tmp_path / "one.vrt.ms1.vrt").read_bytes()
+    options = PansharpenOptions(overwrite=True)
+    with pytest.raises(OutputIsInputError):
+        geodelreg.pansharpen(tmp_path / "one.vrt.ms1.vrt", pan, tmp_path / "one.vrt", options)
+    assert (tmp_path / "one.vrt.ms1.vrt").read_bytes() == part
+
+
+def test_two_sharpened_rasters_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    ms, pan = ramps(tmp_path, 2, (0.0, 0.0)), flat_pan(tmp_path, 60, 60)
+    with ExitStack() as stack:
+        stack.enter_context(pytest.raises(UsageError))
+        stack.enter_context(together())
+        geodelreg.pansharpen(ms, pan, tmp_path / "sharp.tif")
+        geodelreg.pansharpen(ms, pan, tmp_path / "more.tif", PansharpenOptions(bands="9"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ms.tif", "pan.tif"]
+
+
+def test_a_lazy_raster_asks_for_no_number_of_threads(tmp_path: Path) -> None:
+    ms, pan = ramps(tmp_path, 2, (0.0, 0.0)), flat_pan(tmp_path, 60, 60)
+    geodelreg.pansharpen(ms, pan, tmp_path / "sharp.vrt")
+    for vrt in tmp_path.glob("*.vrt"):
+        text = vrt.read_text()
+        assert "NumThreads" not in text
+        assert "NUM_THREADS" not in text
