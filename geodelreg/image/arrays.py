@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
@@ -19,10 +19,8 @@ from geodelreg.errors import (
     RasterUnreadableError,
 )
 from geodelreg.geo.pixel import corner_to_centre, pixel_centres
+from geodelreg.image.chunks import Chunks, Fetch
 from geodelreg.values.raster import Grid
-
-Fetch = Callable[[int, slice, slice], Any]
-"""Pixels (h, w) of one band, counted from 0, of some rows and columns."""
 
 _CODE = re.compile(r"[A-Za-z]+:[\w.]+$")
 _UNEVEN_PX = 1e-2
@@ -186,7 +184,7 @@ def array_dataset(array: Any, grid: Grid, name: str) -> ArrayDataset:
     chunks = getattr(array, "chunks", None)
     return ArrayDataset(
         name=name,
-        fetch=fetch,
+        fetch=_kept(fetch, chunks[-2:] if chunks else (), array.dtype),
         shape=(shape[-2], shape[-1]),
         dtypes=(_number_type(array.dtype, name),) * count,
         transform=grid.transform,
@@ -249,12 +247,11 @@ def xarray_dataset(raster: Any, name: str) -> ArrayDataset:
 
     shape = (int(raster.sizes[rows]), int(raster.sizes[columns]))
     first = planes[0][1]
-    chunks = first.chunks or tuple(
-        (first.encoding.get("preferred_chunks", {}).get(side, 0),) for side in (rows, columns)
-    )
+    preferred = first.encoding.get("preferred_chunks", {})
+    chunks = first.chunks or tuple(preferred.get(side, 0) for side in (rows, columns))
     return ArrayDataset(
         name=name,
-        fetch=fetch,
+        fetch=_kept(fetch, chunks, first.dtype),
         shape=shape,
         dtypes=tuple(_number_type(plane.dtype, name) for _, plane in planes),
         transform=_transform(raster, rows, columns, name),
@@ -342,6 +339,13 @@ def _transform(raster: Any, rows: str, columns: str, name: str) -> Affine:
         if all(np.abs(np.subtract(apart @ c, c)).max() <= _EXACT_PX for c in corners):
             return Affine(*tuple(written)[:6])
     return Affine(*(float(value) for value in tuple(found)[:6]))
+
+
+def _kept(fetch: Fetch, chunks: Sequence[Any], dtype: Any) -> Fetch:
+    """Keep chunks of dask, which would be computed again for the next window."""
+    if len(chunks) != 2 or not all(isinstance(sizes, tuple) for sizes in chunks):
+        return fetch
+    return Chunks(fetch, (chunks[0], chunks[1]), np.dtype(dtype).itemsize)
 
 
 def _block(chunks: Sequence[Any], shape: Sequence[int]) -> tuple[int, int]:

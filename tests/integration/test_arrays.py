@@ -367,3 +367,20 @@ def test_a_plot_shows_the_kept_points_where_they_lie(of_files: geodelreg.Alignme
     first = transform @ tuple(points.reference_px[points.kept][0])
     assert np.hypot(*(drawn - first).T).min() < 1e-6
     assert str(int(points.kept.sum())) in axes.get_title()
+
+
+def test_chunks_of_dask_are_not_computed_for_every_window() -> None:
+    computed = 0
+
+    def count(block: Any) -> Any:
+        nonlocal computed
+        computed += 1
+        return block
+
+    pan = rioxarray.open_rasterio(PAN, chunks=200)
+    assert isinstance(pan, xarray.DataArray)
+    meta = np.empty((0, 0, 0), pan.dtype)
+    counted = pan.copy(data=pan.data.map_blocks(count, dtype=pan.dtype, meta=meta))
+    blocks = int(np.prod(counted.data.numblocks))
+    geodelreg.align(MS, counted)
+    assert blocks <= computed <= 2 * blocks
