@@ -12,11 +12,12 @@ from geodelreg.version import __version__
 
 if TYPE_CHECKING:
     from geodelreg import errors
+    from geodelreg.alignment import Alignment
     from geodelreg.api import align, check
     from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
     from geodelreg.sharpen import pansharpen
-    from geodelreg.values.result import Alignment
+    from geodelreg.values.raster import Grid
     from geodelreg.writing import export_gcps, revert, write, write_in_place
 
 
@@ -24,6 +25,7 @@ __all__ = [
     "AlignOptions",
     "Alignment",
     "Check",
+    "Grid",
     "PansharpenOptions",
     "WriteOptions",
     "__version__",
@@ -39,8 +41,9 @@ __all__ = [
 
 _HOMES = {
     "AlignOptions": "geodelreg.options",
-    "Alignment": "geodelreg.values.result",
+    "Alignment": "geodelreg.alignment",
     "Check": "geodelreg.product.check",
+    "Grid": "geodelreg.values.raster",
     "PansharpenOptions": "geodelreg.options",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",

@@ -6,25 +6,28 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Unpack
 
 from geodelreg.align_pair import align_pair
+from geodelreg.alignment import Alignment
 from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
     NoOverlapError,
     UsageError,
 )
+from geodelreg.image.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
 from geodelreg.judge.words import remedy_of
+from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
-from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution, Timings
-from geodelreg.writing import AnyPath, paths_of
+from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution, Timings
 
 MAX_LIMIT_PX = 1e6
 
@@ -42,32 +45,57 @@ class _Rasters:
 
 @contextmanager
 def _open(
-    source: AnyPath | Sequence[AnyPath], reference: AnyPath, options: AlignOptions
+    source: AnyRaster | Sequence[AnyRaster],
+    reference: AnyRaster,
+    options: AlignOptions,
+    masks: Sequence[AnyMask],
+    pan_masks: Sequence[AnyMask],
 ) -> Iterator[_Rasters]:
-    timings = Timings()
+    timings, allow = Timings(), options.allow
     with ExitStack() as stack:
         with timings("open"):
-            ms = stack.enter_context(open_raster(source, options.masks, allow=options.allow))
+            ms = stack.enter_context(open_raster(source, [*options.masks, *masks], allow=allow))
             pan = stack.enter_context(
-                open_raster(reference, options.pan_masks, allow=options.allow)
+                open_raster(reference, [*options.pan_masks, *pan_masks], allow=allow)
             )
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
-            inputs = _input(ms, paths_of(source)), _input(pan, (str(reference),))
-        yield _Rasters(ms, pan, *inputs, timings)
+        yield _Rasters(ms, pan, _input(ms), _input(pan), timings)
 
 
-def _input(reader: RasterReader, paths: tuple[str, ...]) -> Input:
-    return Input(paths, reader.grid, tuple(map(fingerprint, paths)))
+def _input(reader: RasterReader) -> Input:
+    names, in_memory = reader.given, reader.in_memory
+    digests = ("",) * len(names) if in_memory else tuple(map(fingerprint, names))
+    return Input(names, reader.grid, digests, in_memory)
+
+
+def _asked(
+    options: AlignOptions | None,
+    knobs: AlignKnobs,
+    mask: AnyMask | Sequence[AnyMask] | None,
+    pan_mask: AnyMask | Sequence[AnyMask] | None,
+) -> tuple[AlignOptions, list[AnyMask], list[AnyMask]]:
+    """Options with the keywords in them, and the masks that have no name."""
+    options = replace(options or AlignOptions(), **knobs)
+    (names, arrays), (pan_names, pan_arrays) = split_masks(mask), split_masks(pan_mask)
+    options = replace(
+        options,
+        masks=(*options.masks, *names),
+        pan_masks=(*options.pan_masks, *pan_names),
+    )
+    return options, arrays, pan_arrays
 
 
 def align(
-    source: AnyPath | Sequence[AnyPath],
-    reference: AnyPath,
+    source: AnyRaster | Sequence[AnyRaster],
+    reference: AnyRaster,
     options: AlignOptions | None = None,
     *,
+    mask: AnyMask | Sequence[AnyMask] | None = None,
+    pan_mask: AnyMask | Sequence[AnyMask] | None = None,
     progress: Progress | None = None,
+    **knobs: Unpack[AlignKnobs],
 ) -> Alignment:
     """Find the correction of a multispectral raster's header against a panchromatic one.
 
@@ -75,13 +103,20 @@ def align(
 
     Parameters
     ----------
-    source : path or sequence of paths
-        The MS raster, or one file per band with one shared correction.
-    reference : path
+    source : raster or sequence of rasters
+        The MS raster, or one per band with one shared correction.  Each is a path, an open dataset
+        of rasterio, an array with its grid ``(array, Grid)``, or a DataArray or Dataset of xarray
+        with rioxarray; arrays are read window by window.
+    reference : raster
         The PAN raster; any raster that is taken as true.
     options : AlignOptions, optional
+    mask, pan_mask : mask or sequence of masks, optional
+        More masks of MS and of PAN: names as in `AlignOptions.masks`, or arrays of their pixels,
+        which hide where they are not 0.
     progress : callable, optional
         Called with a fraction 0 to 1 and the name of the step.
+    **knobs
+        Fields of `AlignOptions`, which replace those of `options`.
 
     Returns
     -------
@@ -96,9 +131,11 @@ def align(
         When a mask of `options` cannot be used.
     GeodelregError
         Its other kinds, for bad input.
+    TypeError
+        When an argument is of the wrong type.
     """
-    options = options or AlignOptions()
-    with _open(source, reference, options) as rasters:
+    options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
+    with _open(source, reference, options, masks, pan_masks) as rasters:
         alignment, _ = _examine(rasters, options, progress)
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
@@ -112,21 +149,24 @@ def align(
 
 
 def check(
-    source: AnyPath | Sequence[AnyPath],
-    reference: AnyPath,
+    source: AnyRaster | Sequence[AnyRaster],
+    reference: AnyRaster,
     options: AlignOptions | None = None,
     *,
     limit_px: float = 0.5,
     per_band: bool = False,
+    mask: AnyMask | Sequence[AnyMask] | None = None,
+    pan_mask: AnyMask | Sequence[AnyMask] | None = None,
     progress: Progress | None = None,
+    **knobs: Unpack[AlignKnobs],
 ) -> Check:
     """Tell whether a multispectral raster lies where a panchromatic one says; write nothing.
 
     Parameters
     ----------
-    source : path or sequence of paths
-        The MS raster, or one file per band.
-    reference : path
+    source : raster or sequence of rasters
+        The MS raster, or one per band, as for `align`.
+    reference : raster
         The PAN raster.
     options : AlignOptions, optional
         Its `tolerance_px`, `max_residual_px` and `on_local` have no meaning here: whatever is found
@@ -135,8 +175,12 @@ def check(
         Largest misalignment, anywhere in the overlap, that counts as aligned, PAN pixels.
     per_band : bool
         Also match each band by itself.
+    mask, pan_mask : mask or sequence of masks, optional
+        As for `align`.
     progress : callable, optional
         Called with a fraction 0 to 1 and the name of the step.
+    **knobs
+        Fields of `AlignOptions`, which replace those of `options`.
 
     Returns
     -------
@@ -149,12 +193,14 @@ def check(
         If `limit_px` is negative.
     GeodelregError
         Its other kinds, for bad input.
+    TypeError
+        When an argument is of the wrong type.
     """
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
-    options = options or AlignOptions()
+    options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
     options = replace(options, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn")
-    with _open(source, reference, options) as rasters:
+    with _open(source, reference, options, masks, pan_masks) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = part_of(progress, 0, count + 1)
         alignment, misalignment = _examine(rasters, options, report)
@@ -199,7 +245,8 @@ def _examine(
         pair, solution = align_pair(ms, pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
-    unsure = [unsettled(Path(path)) for path in (*rasters.source.paths, *rasters.reference.paths)]
+    files = [one for one in (rasters.source, rasters.reference) if not one.in_memory]
+    unsure = [unsettled(Path(path)) for one in files for path in one.paths]
     notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
     alignment = _alignment(rasters, pair, solution, notes + mask_warnings(ms, pan))
     return alignment, measure_misalignment(pair, solution)

@@ -80,6 +80,10 @@ class BandGridError(GeodelregError):
     """Files given as bands of one image do not share one CRS or do not overlap."""
 
 
+class ArrayShapeError(GeodelregError):
+    """An array does not fit its grid, or a DataArray is no grid of rows and columns."""
+
+
 class NoDataError(GeodelregError):
     """A band is constant or has no valid pixel: nothing can be matched on it."""
 

@@ -52,6 +52,8 @@ def _check_masks(options: object, name: str) -> None:
 
 def _check_range(options: object, name: str, low: float, high: float) -> None:
     value = getattr(options, name)
+    if value is not None and not isinstance(value, int | float):
+        raise TypeError(f"{name} = {value!r} is no number")
     if value is not None and not low <= value <= high:
         raise UsageError(f"{name} = {value} is out of range", f"Use {low:g} to {high:g}.")
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
 from geodelreg.image.opening import dataset_grid, open_dataset
 from geodelreg.image.reader import check_band, open_raster
+from geodelreg.knobs import PansharpenKnobs
 from geodelreg.options import PansharpenOptions, check_header_holds
 from geodelreg.pair import Progress
 from geodelreg.product.atomic import together
@@ -33,6 +36,7 @@ def pansharpen(
     allow: str = "local",
     pan_band: int = 1,
     progress: Progress | None = None,
+    **knobs: Unpack[PansharpenKnobs],
 ) -> None:
     """Sharpen MS with PAN on PAN's exact grid, with GDAL's weighted Brovey.
 
@@ -53,13 +57,15 @@ def pansharpen(
         Band of PAN, from 1.
     progress : callable, optional
         Called with a fraction 0 to 1 and the name of the step.
+    **knobs
+        Fields of `PansharpenOptions`, which replace those of `options`.
 
     Raises
     ------
     OutputExistsError, OutputIsInputError, OutputUnwritableError, NoOverlapError, UsageError, ...
         Nothing is then changed on disk.
     """
-    options = options or PansharpenOptions()
+    options = replace(options or PansharpenOptions(), **knobs)
     if alignment is not None:
         check_header_holds(alignment.options.model)
     paths = [as_path(path) for path in paths_of(source)]

@@ -7,12 +7,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import Unpack
 
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import as_allowed
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.image.input_files import input_files
 from geodelreg.image.reader import open_raster
+from geodelreg.knobs import WriteKnobs
 from geodelreg.masking import parse_mask
 from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.provenance import provenance_tags
@@ -30,7 +32,12 @@ def paths_of(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
 
 
 @as_allowed
-def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = None) -> list[str]:
+def write(
+    alignment: Alignment,
+    target: AnyPath,
+    options: WriteOptions | None = None,
+    **knobs: Unpack[WriteKnobs],
+) -> list[str]:
     """Write the MS raster with its corrected georeferencing and the same pixels.
 
     Of several MS files all are written or none.
@@ -43,6 +50,8 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
         The output; with several MS files the folder for them, made when missing.
     options : WriteOptions, optional
         Its `warp` resamples north-up instead of correcting the header.
+    **knobs
+        Fields of `WriteOptions`, which replace those of `options`.
 
     Returns
     -------
@@ -60,7 +69,8 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
-    options = options or WriteOptions()
+    options = replace(options or WriteOptions(), **knobs)
+    check_is_file(alignment)
     if options.georef != "gcps":
         check_header_holds(alignment.options.model)
     tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
@@ -100,6 +110,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.inplace import edit_in_place
 
     check_header_holds(alignment.options.model)
+    check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
         return []
@@ -178,8 +189,23 @@ def input_paths(names: Iterable[str], allow: str) -> list[Path]:
 
 
 def _inputs(alignment: Alignment) -> list[Path]:
-    names = [*alignment.source.paths, alignment.reference.paths[0], *masks_of(alignment)]
-    return input_paths(names, alignment.options.allow)
+    rasters = [one for one in (alignment.source, alignment.reference) if not one.in_memory]
+    names = [path for one in rasters for path in one.paths]
+    return input_paths([*names, *masks_of(alignment)], alignment.options.allow)
+
+
+def check_is_file(alignment: Alignment) -> None:
+    """Refuse to write MS that was read from memory.
+
+    Raises
+    ------
+    UsageError
+    """
+    if alignment.source.in_memory:
+        raise UsageError(
+            f"MS is no file but {', '.join(alignment.source.paths)}",
+            "Correct it in memory, alignment.apply(dataarray), or align the file itself.",
+        )
 
 
 def masks_of(alignment: Alignment) -> list[str]:

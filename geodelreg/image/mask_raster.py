@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.door.names import LOCAL
 from geodelreg.errors import (
-    AccessNotAllowedError,
     CrsTransformError,
     GeodelregError,
     MaskError,
@@ -24,14 +21,14 @@ from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.image.environment import gdal_calls
-from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.image.inputs import Opened
+from geodelreg.image.opening import dataset_grid
 from geodelreg.image.quality import hidden_values, impossible_values
 from geodelreg.image.validity import alpha_bands
 from geodelreg.masking import (
     AUTO,
     BINARY,
     LANDSAT_QA,
-    MASK_KINDS,
     SENTINEL2_SCL,
     MaskSpec,
     is_old_landsat,
@@ -60,12 +57,9 @@ class RasterMask:
     spec : MaskSpec
     image : Grid
         Of the image; a mask of its size that does not say where it lies lies there, too.
-    stack : ExitStack
-        Closes the file.
+    opened : Opened
     band : int, optional
         Number of the mask's band; the only one when not given.
-    allow : str
-        What may be opened, `AlignOptions.allow`.
 
     Attributes
     ----------
@@ -78,28 +72,21 @@ class RasterMask:
     Raises
     ------
     MaskError
-        If the file cannot be read, is no mask of this kind, or lies elsewhere.
+        If it is no mask of this kind, or lies elsewhere.
     """
 
     def __init__(
         self,
         spec: MaskSpec,
         image: Grid,
-        stack: ExitStack,
+        opened: Opened,
         band: int | None = None,
-        allow: str = LOCAL,
     ) -> None:
-        self.path = spec.path
+        self.path, self._dataset = spec.path, opened.dataset
         self._hide = spec.hide
         self._lock = (
             threading.Lock()
         )  # the image is read by several threads, the mask has one handle
-        try:
-            self._dataset = stack.enter_context(open_dataset(spec.path, allow=allow))
-        except AccessNotAllowedError:
-            raise
-        except GeodelregError as error:
-            raise MaskError(f"the mask {error.cause}", _remedy(spec.path, error)) from error
         self.band = band or _only_band(spec.path, self._dataset)
         self.kind = self._kind_of(spec.kind)
         self._nodata = self._dataset.nodatavals[self.band - 1]
@@ -199,12 +186,6 @@ class RasterMask:
                 "was interpolated",
                 f"List the values to hide, e.g. {self.path}=3,8-10, or say {self.path}={BINARY}.",
             )
-
-
-def _remedy(path: str, error: GeodelregError) -> str:
-    if "=" in path:
-        return f"After = come values (3,8-10) or one of {', '.join(MASK_KINDS)}; else check it."
-    return error.remedy
 
 
 def _only_band(path: str, dataset: Any) -> int:

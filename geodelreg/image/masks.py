@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import PurePath
 
 import numpy as np
 
 from geodelreg.door.names import LOCAL, check_name
 from geodelreg.door.vectors import is_vector
+from geodelreg.errors import AccessNotAllowedError, GeodelregError, MaskError
+from geodelreg.image.inputs import AnyMask, Opened, mask_opened, opened
 from geodelreg.image.mask_raster import RasterMask
 from geodelreg.image.mask_vector import VectorMask
-from geodelreg.masking import MaskSpec, MaskUse, Ranges, parse_mask
+from geodelreg.masking import MASK_KINDS, MaskSpec, MaskUse, Ranges, parse_mask
 from geodelreg.values.raster import BoolArray, Grid
 
 _WHOLE = 0.995
@@ -26,10 +29,10 @@ class Masks:
     image : Grid
     image_name : str
         For messages.
-    names : sequence of str
-        Masks as the user named them, ``FILE`` or ``FILE=HIDE``.
-    bands : sequence of (str, int, str)
-        Path, number and kind of the quality bands that are part of the image.
+    names : sequence of masks
+        As the user named them, ``FILE`` or ``FILE=HIDE``, or arrays.
+    bands : sequence of (Opened, int, str)
+        Raster, number and kind of the quality bands that are part of the image.
     stack : ExitStack
         Closes the files.
     allow : str
@@ -47,25 +50,29 @@ class Masks:
         self,
         image: Grid,
         image_name: str,
-        names: Sequence[str],
-        bands: Sequence[tuple[str, int, str]],
+        names: Sequence[AnyMask],
+        bands: Sequence[tuple[Opened, int, str]],
         stack: ExitStack,
         allow: str = LOCAL,
     ) -> None:
         self._image_name = image_name
         self._masks: list[RasterMask | VectorMask] = []
         self._hide: list[Ranges] = []
-        for path, number, kind in bands:
-            self._masks.append(RasterMask(MaskSpec(path, kind), image, stack, number, allow))
+        for raster, number, kind in bands:
+            again = replace(raster, dataset=raster.again(stack)) if raster.is_file else raster
+            self._masks.append(RasterMask(MaskSpec(raster.name, kind), image, again, number))
             self._hide.append(())
-        for spec in map(parse_mask, names):
-            check_name(spec.path, allow)
-            vector = is_vector(spec.path)
-            self._masks.append(
-                VectorMask(spec, image, allow)
-                if vector
-                else RasterMask(spec, image, stack, allow=allow)
-            )
+        for name in names:
+            spec = parse_mask(name) if isinstance(name, str) else None
+            if spec is None:
+                array = mask_opened(name, image, stack, allow)
+                spec = MaskSpec(array.name)
+                self._masks.append(RasterMask(spec, image, array))
+            elif is_vector(spec.path):
+                check_name(spec.path, allow)
+                self._masks.append(VectorMask(spec, image, allow))
+            else:
+                self._masks.append(RasterMask(spec, image, _opened(spec.path, stack, allow)))
             self._hide.append(spec.hide)
         self._hidden = np.zeros(len(self._masks) + 1, dtype=np.int64)
         self._seen = 0
@@ -122,3 +129,17 @@ class Masks:
             if isinstance(mask, VectorMask) and mask.is_elsewhere:
                 notes.append(f"nothing in the mask {name} touches {self._image_name}")
         return tuple(notes)
+
+
+def _opened(path: str, stack: ExitStack, allow: str) -> Opened:
+    """A mask that is a file."""
+    check_name(path, allow)
+    try:
+        return opened(path, stack, allow)
+    except AccessNotAllowedError:
+        raise
+    except GeodelregError as error:
+        remedy = f"After = come values (3,8-10) or one of {', '.join(MASK_KINDS)}; else check it."
+        raise MaskError(
+            f"the mask {error.cause}", remedy if "=" in path else error.remedy
+        ) from error

@@ -16,12 +16,12 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from geodelreg.door.names import LOCAL, is_local
+from geodelreg.door.names import is_local
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.image.decimate import BoxAverage, Share
 from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
-from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.image.inputs import Opened
 from geodelreg.image.overviews import Placement, find_placement
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.masking import quality_bands
@@ -51,14 +51,14 @@ class RasterFile:
 
     Parameters
     ----------
-    path : str
+    opened : Opened
     stack : ExitStack
-        Closes the file, and its overviews when they were needed.
-    allow : str
-        What may be opened, `AlignOptions.allow`.
+        Closes its overviews when they were needed.
 
     Attributes
     ----------
+    path : str
+        Or the name of what is no file.
     grid : Grid
     image_bands : tuple of int
         1-based numbers of the bands that are neither alpha nor quality bands.
@@ -74,16 +74,15 @@ class RasterFile:
     UnsupportedGeoreferenceError, MissingCrsError
     """
 
-    def __init__(self, path: str, stack: ExitStack, allow: str = LOCAL) -> None:
-        self.path, self._allow = path, allow
-        self.dataset = stack.enter_context(open_dataset(path, allow=allow))
-        self.grid = dataset_grid(path, self.dataset)
+    def __init__(self, opened: Opened, stack: ExitStack) -> None:
+        self.path, self.opened, self.dataset = opened.name, opened, opened.dataset
+        self.grid = opened.grid()
         self._stack = stack
         every = range(1, self.dataset.count + 1)
         self._alpha = alpha_bands(self.dataset)
         if len(self._alpha) == len(every):
             self._alpha = ()
-        self.quality_bands = quality_bands(path, self.dataset.descriptions)
+        self.quality_bands = quality_bands(self.path, self.dataset.descriptions)
         self.hides: Callable[[Grid], BoolArray] | None = None
         known = {*self._alpha, *self.quality_bands}
         self.image_bands = tuple(number for number in every if number not in known)
@@ -96,12 +95,11 @@ class RasterFile:
 
     @cached_property
     def _overviews(self) -> tuple[DatasetReader, ...]:
+        if not self.opened.is_file:
+            return ()
         with gdal_calls():
             count = min(len(self.dataset.overviews(n)) for n in range(1, self.dataset.count + 1))
-        return tuple(
-            self._stack.enter_context(open_dataset(self.path, index, self._allow))
-            for index in range(count)
-        )
+        return tuple(self.opened.again(self._stack, index) for index in range(count))
 
     @property
     def overview_factors(self) -> tuple[float, ...]:
@@ -201,9 +199,9 @@ class RasterFile:
     def _handles(self, pieces: int) -> list[DatasetReader]:
         """Handles of the full raster, one for each thread that is worth starting."""
         wanted = min(os.cpu_count() or 1, _MOST_THREADS, pieces // _PIECES_PER_THREAD)
-        while is_local(self.path) and len(self._more_handles) + 1 < wanted:
-            handle = open_dataset(self.path, allow=self._allow)
-            self._more_handles.append(self._stack.enter_context(handle))
+        again = self.opened.is_file and is_local(self.path)
+        while again and len(self._more_handles) + 1 < wanted:
+            self._more_handles.append(self.opened.again(self._stack))
         return [self.dataset, *self._more_handles[: max(wanted - 1, 0)]]
 
     def _placement(self, overview: int) -> Placement:

@@ -23,12 +23,11 @@ from geodelreg.image.environment import (
     gdal_calls,
     passing_through,
 )
+from geodelreg.image.inputs import AnyMask, AnyRaster, as_list, opened
 from geodelreg.image.raster_file import RasterFile
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
-    from os import PathLike
-
     from geodelreg.image.masks import Masks
 
 logger = logging.getLogger(__name__)
@@ -56,23 +55,33 @@ class RasterReader:
     other_paths : tuple of str
         Files given with them that lie on another grid, or are masks of the others: a correction
         applies to them, too.
+    given : tuple of str
+        Both, in the order that they were given in.
+    in_memory : bool
+        One of them at least is no file; its name stands for its path.
     masks : Masks or None
         What hides pixels beyond what the files themselves say; None when nothing does.
     """
 
     def __init__(
-        self, paths: Sequence[str], masks: Sequence[str] | None = None, *, allow: str = LOCAL
+        self,
+        rasters: Sequence[AnyRaster],
+        masks: Sequence[AnyMask] | None = None,
+        *,
+        allow: str = LOCAL,
     ) -> None:
-        if not paths:
+        if not rasters:
             raise UsageError("no raster file was named", "Give at least one.")
         self._lock = threading.Lock()
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
-            files = [RasterFile(path, stack, allow) for path in paths]
+            files = [RasterFile(opened(one, stack, allow), stack) for one in rasters]
             self._files = _on_the_common_grid(_with_image_bands(files))
             self.paths = tuple(file.path for file in self._files)
             self.masks = self._open_masks(files, masks, stack, allow)
             self._stack = stack.pop_all()
+        self.given = tuple(file.path for file in files)
+        self.in_memory = not all(file.opened.is_file for file in files)
         self.other_paths = tuple(file.path for file in files if file not in self._files)
         self._bands = _list_bands(self._files)
         self._decimations = self._common_decimations()
@@ -175,11 +184,15 @@ class RasterReader:
         return passing_through(TILES_BYTES)
 
     def _open_masks(
-        self, files: list[RasterFile], names: Sequence[str] | None, stack: ExitStack, allow: str
+        self,
+        files: list[RasterFile],
+        names: Sequence[AnyMask] | None,
+        stack: ExitStack,
+        allow: str,
     ) -> Masks | None:
         """The masks named, and the quality bands of the files."""
         bands = [
-            (file.path, number, kind)
+            (file.opened, number, kind)
             for file in files
             for number, kind in file.quality_bands.items()
             if number not in file.image_bands
@@ -291,8 +304,8 @@ def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
 
 
 def open_raster(
-    path: str | PathLike[str] | Sequence[str | PathLike[str]],
-    masks: Sequence[str] | None = None,
+    source: AnyRaster | Sequence[AnyRaster],
+    masks: Sequence[AnyMask] | None = None,
     *,
     allow: str = LOCAL,
 ) -> RasterReader:
@@ -303,10 +316,12 @@ def open_raster(
 
     Parameters
     ----------
-    path : path or sequence of paths
-        Anything GDAL opens; URLs and ``/vsi…`` paths are passed to it as they are.
-    masks : sequence of str, optional
-        Masks of the image, ``FILE`` or ``FILE=HIDE``.  Bands and files that are called QA_PIXEL or
+    source : raster or sequence of rasters
+        Paths of anything GDAL opens (URLs and ``/vsi…`` paths are passed to it as they are), open
+        datasets of rasterio, arrays with their grids, DataArrays or Datasets of xarray.
+    masks : sequence of masks, optional
+        Masks of the image, ``FILE`` or ``FILE=HIDE``, or arrays that hide where they are not 0.
+        Bands and files that are called QA_PIXEL or
         SCL are masks of the others without being named.  None: nothing is masked.
     allow : str
         What may be opened, `AlignOptions.allow`.
@@ -328,9 +343,12 @@ def open_raster(
         If a mask cannot be used.
     AccessNotAllowedError
         If a name, or what a VRT names, needs more than `allow`.
+    ArrayShapeError
+        If an array does not fit its grid.
+    TypeError
+        If it is no raster at all.
     """
-    paths = [path] if isinstance(path, str) or hasattr(path, "__fspath__") else list(path)
-    return RasterReader([str(one) for one in paths], masks, allow=allow)
+    return RasterReader(as_list(source), masks, allow=allow)
 
 
 def check_band(reader: RasterReader, number: int) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.crs import map_points
 from geodelreg.product.atomic import write_bytes_atomically
 from geodelreg.product.targets import STDOUT
 from geodelreg.values.raster import Band, FloatArray, Grid, IntArray
@@ -257,6 +258,52 @@ def draw_before_after(
             _outline(woven, rows, columns)
             for axes in (woven, zoom):
                 axes.set_axis_off()
+
+
+def draw_tie_points(alignment: Alignment, axes: Axes | None = None) -> Axes:
+    """Tie points where PAN shows them; arrows show how far off MS lay, colours what is left.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    axes : matplotlib.axes.Axes, optional
+        A new figure of pyplot when not given.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        In map coordinates of PAN.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise MissingExtraError("plots need matplotlib", "Install it: pip install matplotlib.")
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.subplots(layout="constrained")[1]
+    points, source, pan = alignment.tie_points, alignment.source.grid, alignment.reference.grid
+    ground = apply_affine(pan.transform, points.reference_px)
+    header = apply_affine(source.transform, points.source_px)
+    off = map_points(header, source.crs_wkt, pan.crs_wkt) - ground
+    kept = points.kept
+    x, y = ground[~kept].T
+    axes.scatter(x, y, s=8, marker="x", c=_REJECTED, lw=0.6, alpha=0.5)
+    chosen = _spread(ground, np.flatnonzero(kept), _ARROWS_AT_MOST)
+    left = np.hypot(*points.residual_px[chosen].T)
+    x, y = ground[chosen].T
+    axes.quiver(x, y, *-off[chosen].T, color=_INK, angles="xy", width=0.003)
+    dots = axes.scatter(x, y, s=14, c=left, cmap="viridis", vmin=0.0, zorder=3)
+    axes.figure.colorbar(dots, ax=axes, label="left after the correction, PAN px")
+    longest = float(np.hypot(*off[kept].T).max()) if kept.any() else 0.0
+    axes.set_title(
+        f"{np.count_nonzero(kept)} tie points; MS moves by up to {longest:.3g} map units"
+    )
+    axes.set_aspect("equal")
+    return axes
 
 
 def _busiest(band: Band, height: int, width: int) -> tuple[slice, slice]:

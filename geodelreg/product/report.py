@@ -112,7 +112,7 @@ def _inputs(alignment: Alignment) -> dict[str, Any]:
 
 def _file(path: str, digest: str) -> dict[str, Any]:
     local = Path(path)
-    size = local.stat().st_size if local.is_file() else None
+    size = local.stat().st_size if digest and local.is_file() else None
     return {"path": path, "size_bytes": size, "fingerprint": digest or None}
 
 

@@ -41,6 +41,16 @@ class Correction:
     corrected: Affine
 
     @property
+    def original_geotransform(self) -> tuple[float, ...]:
+        """`original` in GDAL's order, as in the JSON report."""
+        return tuple(self.original.to_gdal())
+
+    @property
+    def corrected_geotransform(self) -> tuple[float, ...]:
+        """`corrected` in GDAL's order, as in the JSON report."""
+        return tuple(self.corrected.to_gdal())
+
+    @property
     def map_transform(self) -> Affine:
         """Header map coordinates to true map coordinates."""
         transform: Affine = self.corrected @ ~self.original
@@ -215,11 +225,14 @@ class Input:
     grid : Grid
     fingerprints : tuple of str
         Of the files when they were read; "" of what is no local file.
+    in_memory : bool
+        It is no file, or not all of it: of arrays and open datasets `paths` are mere names.
     """
 
     paths: tuple[str, ...]
     grid: Grid
     fingerprints: tuple[str, ...] = ()
+    in_memory: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ import pytest
 import rasterio
 from affine import Affine
 
-from geodelreg import AlignOptions, __version__, align, errors
+from geodelreg import AlignOptions, Grid, __version__, align, errors
 from geodelreg.batch import run
 from geodelreg.batch.job import Pair, Task
 from geodelreg.batch.supervisor import Child
@@ -147,6 +147,9 @@ CASES = {
     ),
     errors.BandNumberError: Case(lambda folder: aligned(folder, AlignOptions(band=9))),
     errors.BandGridError: Case(bands_of_two_crss, ("ms.tif", "b2.tif")),
+    errors.ArrayShapeError: Case(
+        lambda folder: open_raster((np.zeros((9, 9)), Grid(GROUND, (9, 8), UTM18))), ("(9, 9)",)
+    ),
     errors.NoDataError: Case(lambda folder: aligned(folder, constant=True)),
     errors.NoOverlapError: Case(
         lambda folder: aligned(folder, transform=Affine.translation(9e4, 9e4) @ GROUND),

@@ -1,0 +1,55 @@
+"""The knobs of `geodelreg.options` as keywords of functions, for type checkers."""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+
+class AlignKnobs(TypedDict, total=False):
+    """Fields of `AlignOptions`."""
+
+    method: str
+    model: str
+    band: int | None
+    pan_band: int
+    masks: tuple[str, ...]
+    pan_masks: tuple[str, ...]
+    search_radius_px: float
+    tolerance_px: float
+    ratio: float
+    max_keypoints: int
+    max_shift_px: float | None
+    max_rotation_deg: float | None
+    max_scale: float | None
+    max_residual_px: float
+    on_local: str
+    threads: int
+    allow: str
+    seed: int
+
+
+class WriteKnobs(TypedDict, total=False):
+    """Fields of `WriteOptions`."""
+
+    overwrite: bool
+    driver: str | None
+    creation_options: tuple[str, ...]
+    georef: str
+    strip_rpc: bool
+    warp: bool
+    warp_grid: str
+    resampling: str
+
+
+class PansharpenKnobs(TypedDict, total=False):
+    """Fields of `PansharpenOptions`."""
+
+    overwrite: bool
+    driver: str | None
+    creation_options: tuple[str, ...]
+    resampling: str
+    weights: str
+    bands: str
+    extent: str
+    nodata: float | None
+    bit_depth: int | None
