@@ -15,6 +15,9 @@ from geodelreg.errors import shown
 
 Progress = Callable[[float, str], None]
 
+LOGGED = 0.1
+"""Share of a run after which the log says again how far it is."""
+
 
 class _Stderr(logging.Handler):
     """Log records to whatever stderr is now: the progress bar replaces it while it is shown."""
@@ -67,13 +70,13 @@ def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
 
 
 def log_steps(show: Progress | None) -> Progress:
-    """Log each step when it begins, at level info, and pass the progress on to a bar if any."""
-    begun: list[str] = []
+    """Log each step when it begins, and each further tenth, at level info; feed a bar if any."""
+    last: dict[str, float] = {}
 
     def report(fraction: float, text: str) -> None:
-        if text not in begun:
-            begun.append(text)
-            logging.getLogger(__name__).info("%s", text)
+        if fraction >= last.get(text, -1.0) + LOGGED:
+            last[text] = fraction
+            logging.getLogger(__name__).info("%s, %.0f %%", text, 100 * fraction)
         if show is not None:
             show(fraction, text)
 

@@ -85,15 +85,17 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     sources, reference = ms_and_pan(rasters)
     options, align_options = build(PansharpenOptions, given), build(AlignOptions, given)
     import geodelreg
+    from geodelreg.pair import part_of
     from geodelreg_cli.outputs import check_targets
 
     check_targets([*sources, reference], [given["output"]], options.overwrite)
     source = sources[0] if len(sources) == 1 else sources
     alignment: Alignment | None = None
     with progress_bar(given["quiet"]) as bar:
-        step = log_steps(bar)
+        step, parts = log_steps(bar), 1 if given["no_align"] else 2
         if not given["no_align"]:
-            alignment = geodelreg.align(source, reference, align_options, progress=step)
+            aligning = part_of(step, 0, parts)
+            alignment = geodelreg.align(source, reference, align_options, progress=aligning)
         geodelreg.pansharpen(
             source,
             reference,
@@ -102,7 +104,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
             alignment=alignment,
             allow=align_options.allow,
             pan_band=align_options.pan_band,
-            progress=step,
+            progress=part_of(step, parts - 1, parts),
         )
     for warning in alignment.warnings if alignment else ():
         logging.getLogger(__name__).warning("warning: %s", warning)

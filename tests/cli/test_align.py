@@ -133,7 +133,7 @@ def test_dry_run_writes_no_file_and_verbose_names_the_steps(geodelreg: Command, 
     done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "-v", cwd=pair)
     assert done.returncode == 0
     assert "check points" in done.stderr
-    assert "geodelreg: refining\n" in done.stderr
+    assert "geodelreg: refining, 40 %\n" in done.stderr
     assert "DEBUG" not in done.stderr
     assert done.stdout == ""
     assert snapshot(pair) == before
