@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from geodelreg.api import align, check
     from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
+    from geodelreg.report.output import write_report
     from geodelreg.sharpen import pansharpen
     from geodelreg.values.result import Alignment
     from geodelreg.writing import export_gcps, revert, write, write_in_place
@@ -35,6 +36,7 @@ __all__ = [
     "revert",
     "write",
     "write_in_place",
+    "write_report",
 ]
 
 _HOMES = {
@@ -50,6 +52,7 @@ _HOMES = {
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
     "write_in_place": "geodelreg.writing",
+    "write_report": "geodelreg.report.output",
 }
 
 
