@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from geodelreg.api import align, check
     from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
+    from geodelreg.report.output import write_report
     from geodelreg.sharpen import pansharpen
     from geodelreg.values.raster import Grid
     from geodelreg.writing import export_gcps, revert, write, write_in_place
@@ -37,6 +38,7 @@ __all__ = [
     "revert",
     "write",
     "write_in_place",
+    "write_report",
 ]
 
 _HOMES = {
@@ -53,6 +55,7 @@ _HOMES = {
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
     "write_in_place": "geodelreg.writing",
+    "write_report": "geodelreg.report.output",
 }
 
 

@@ -126,6 +126,10 @@ class GcpFormatError(GeodelregError):
     """A GCP file cannot be read, or its format is unknown."""
 
 
+class ReportError(GeodelregError):
+    """The JSON report is none, is of another version, or tells of other rasters."""
+
+
 class MissingExtraError(GeodelregError):
     """An optional dependency is not installed."""
 

@@ -20,6 +20,20 @@ GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
 EXTENTS = ("pan", "intersection")
+UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
+FLAGS = {
+    "band": ("-b", "--band"),
+    "masks": ("--mask",),
+    "pan_masks": ("--pan-mask",),
+    "threads": ("-j", "--num-threads"),
+    "workers": ("-j", "--workers"),
+    "driver": ("--of",),
+    "creation_options": ("--co",),
+    "warp_grid": ("--grid",),
+    "resampling": ("-r", "--resampling"),
+}
+"""Flags that GDAL's users know by another name than the knob's."""
+FIGURES = ("before-after", "arrows", "mesh", "error", "matches")
 RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
 
 
@@ -30,6 +44,12 @@ def _knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
 def knob_help(options: type, name: str) -> str:
     """Help text of one knob of an options class."""
     return str({f.name: f for f in fields(options)}[name].metadata["help"])
+
+
+def flags(knob: str) -> tuple[str, ...]:
+    """Flags of a knob: ``("--search-radius",)`` for ``search_radius_px``."""
+    bare = next((knob.removesuffix(unit) for unit in UNITS if knob.endswith(unit)), knob)
+    return FLAGS.get(knob, ("--" + bare.replace("_", "-"),))
 
 
 def _check_choice(options: object, name: str) -> None:

@@ -14,6 +14,7 @@ from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
 from geodelreg_cli.console import log_steps, progress_bar
+from geodelreg_cli.figure import kind_option
 from geodelreg_cli.options import (
     GCP_FORMAT,
     SectionCommand,
@@ -50,7 +51,7 @@ Examples:
 
   Also write the control points for QGIS and GDAL, a report and a figure:
     geodelreg align ms.tif pan.tif -o aligned.tif --gcps ms.points \\
-        --gcps ms.geojson --report aligned.json --figure aligned.png
+        --gcps ms.geojson --report aligned.html --figure aligned.png
 
   Look before you write, and pick one number out of the result:
     geodelreg align ms.tif pan.tif --dry-run --json | jq .accuracy
@@ -73,8 +74,9 @@ class Request:
     dry_run: bool
     gcps: tuple[Path, ...]
     gcp_format: str | None
-    report: Path | None
+    reports: tuple[Path, ...]
     figure: Path | None
+    figure_kind: str
     json: bool
     quiet: bool
     options: AlignOptions
@@ -130,19 +132,22 @@ def align_params() -> list[SectionOption]:
         flag(
             "--report",
             type=FILE,
-            metavar="FILE.json",
+            multiple=True,
+            metavar="FILE",
             section=OUTPUT,
-            help="Write everything that was found out as JSON; also after a refusal. - writes to "
-            "stdout.",
+            help="Write everything that was found out; also after a refusal. .html is a page to "
+            "look at, with before and after (needs the report extra); else JSON. - writes JSON to "
+            "stdout. May be repeated.",
         ),
         flag(
             "--figure",
             type=FILE,
             metavar="FILE.png",
             section=OUTPUT,
-            help="Draw the tie points on both images (needs matplotlib, the report extra); - is "
-            "stdout.",
+            help="Draw the result as PNG, SVG or PDF; also after a refusal (needs matplotlib, the "
+            "report extra). - is stdout.",
         ),
+        kind_option("--figure-kind", OUTPUT),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
         *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
         *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
@@ -189,8 +194,9 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
         dry_run=given["dry_run"],
         gcps=given["gcps"],
         gcp_format=given["gcp_format"],
-        report=given["report"],
+        reports=given["report"],
         figure=given["figure"],
+        figure_kind=given["figure_kind"],
         json=given["json"],
         quiet=given["quiet"],
         options=build(AlignOptions, given),
@@ -208,10 +214,11 @@ def _check_outputs(request: Request) -> list[Path]:
     """
     from geodelreg.product.atomic import tidy
     from geodelreg.product.targets import STDOUT, Inputs
+    from geodelreg.report.output import check_report
     from geodelreg_cli.outputs import check_targets, raster_targets
 
     _check_gcp_formats(request)
-    side_files = [path for path in (*request.gcps, request.report, request.figure) if path]
+    side_files = [path for path in (*request.gcps, *request.reports, request.figure) if path]
     masks = (*request.options.masks, *request.options.pan_masks)
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
@@ -225,6 +232,8 @@ def _check_outputs(request: Request) -> list[Path]:
             request.output if len(request.sources) > 1 else None,
             rasters,
         )
+        for path in request.reports:
+            check_report(path)
         if request.figure is not None:
             from geodelreg.product.figures import check_drawable
 
@@ -257,10 +266,10 @@ def _check_gcp_formats(request: Request) -> None:
 
 
 def _run(request: Request, inputs: Sequence[Path]) -> None:
-    """Align, then write what was asked for, all or nothing; a refusal leaves the report only."""
+    """Align, then write what was asked for, all or nothing; a refusal leaves the reports only."""
     import geodelreg
     from geodelreg.product.atomic import together
-    from geodelreg.product.report import report_json, summary_text
+    from geodelreg.product.report import summary_text
 
     source = request.sources[0] if len(request.sources) == 1 else request.sources
     try:
@@ -271,14 +280,16 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
     except AlignmentRefusedError as refusal:
         if refusal.alignment is not None:
             with together(inputs=lambda: inputs):
-                _write_report(report_json(refusal.alignment), request)
+                _draw(refusal.alignment, request)
+                _write_texts(_reports(refusal.alignment, request), request)
             if not request.quiet:
                 click.echo(_step_counts(refusal.alignment), err=True)
         raise
-    report = report_json(alignment)  # of the inputs as they are: --in-place changes one
+    reports = _reports(alignment, request)  # of the inputs as they are: --in-place changes one
     with together(inputs=lambda: inputs):
+        _draw(alignment, request)
         _write(alignment, request)
-        _write_report(report, request)
+        _write_texts(reports, request)
     if not request.quiet:
         click.echo(summary_text(alignment), err=True)
         click.echo(_step_counts(alignment), err=True)
@@ -291,12 +302,10 @@ def _step_counts(alignment: Alignment) -> str:
 
 
 def _write(alignment: Alignment, request: Request) -> None:
-    """Write the raster, then the control points and the figure."""
+    """Write the raster, then the control points."""
     import geodelreg
-    from geodelreg_cli.figure import bands_to_show
 
     overwrite = request.write_options.overwrite
-    shown = None if request.figure is None else bands_to_show(alignment)
     warnings: list[str] = []
     if request.in_place:
         warnings = geodelreg.write_in_place(alignment)
@@ -306,16 +315,28 @@ def _write(alignment: Alignment, request: Request) -> None:
         logging.getLogger(__name__).warning("warning: %s", warning)
     for path in request.gcps:
         geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite=overwrite)
-    if request.figure is not None and shown is not None:
-        from geodelreg.product.figures import draw_matches
-
-        draw_matches(*shown, alignment, request.figure, overwrite=overwrite)
 
 
-def _write_report(text: str, request: Request) -> None:
-    from geodelreg.product.atomic import write_text_atomically
+def _draw(alignment: Alignment, request: Request) -> None:
+    """The figure, of the inputs as they are."""
+    if request.figure is not None:
+        from geodelreg.report.figures import draw_figure
+
+        overwrite = request.write_options.overwrite
+        draw_figure(alignment, request.figure_kind, request.figure, overwrite)
+
+
+def _reports(alignment: Alignment, request: Request) -> list[tuple[Path, str]]:
+    """Where reports go, and their texts."""
     from geodelreg.product.targets import STDOUT
+    from geodelreg.report.output import report_text
 
-    for path in (request.report, STDOUT if request.json else None):
-        if path is not None:
-            write_text_atomically(path, text + "\n", request.write_options.overwrite)
+    paths = [*request.reports, *([STDOUT] if request.json else [])]
+    return [(path, report_text(alignment, path)) for path in paths]
+
+
+def _write_texts(texts: Sequence[tuple[Path, str]], request: Request) -> None:
+    from geodelreg.product.atomic import write_text_atomically
+
+    for path, text in texts:
+        write_text_atomically(path, text, request.write_options.overwrite)

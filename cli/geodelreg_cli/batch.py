@@ -55,6 +55,9 @@ Examples:
   On a cluster of Dask:
     geodelreg batch pairs.csv --dask tcp://scheduler:8786
 
+  To look at: a table and a map in report/index.html, and a page a pair:
+    geodelreg batch pairs.csv --report-dir report
+
 Exit codes: 1 some failed; else 4 some are misaligned (--check); else 3 some were refused or cannot
 be told; else 0. 2 wrong usage, or a manifest with a mistake: nothing was started.
 """
@@ -128,8 +131,9 @@ def batch_params() -> list[SectionOption]:
             multiple=True,
             metavar="FILE",
             section=LEDGER,
-            help="All results at the end: .csv, or .parquet (needs the parquet extra). May be "
-            "repeated. Without it a CSV beside the ledger, pairs.results.csv for pairs.ledger.",
+            help="All results at the end: .csv, .parquet (needs the parquet extra), or .html to "
+            "look at (needs the report extra). May be repeated. Without it a CSV beside the "
+            "ledger, pairs.results.csv for pairs.ledger.",
         ),
         flag(
             "--footprints",
@@ -139,6 +143,14 @@ def batch_params() -> list[SectionOption]:
             section=LEDGER,
             help="Where each MS lies, with its outcome: .geojson, or .gpkg (needs the vector "
             "extra). May be repeated.",
+        ),
+        flag(
+            "--report-dir",
+            type=FILE,
+            metavar="FOLDER",
+            section=LEDGER,
+            help="Pages to look at: index.html with a table and a map of all pairs, and one page a "
+            "pair, also of refused ones (needs the report extra).",
         ),
         *knob_options(BatchOptions, RUNNING, without=["check", "limit_px", "in_place"]),
         flag(
@@ -217,6 +229,7 @@ def _batch(manifest: Path | None, given: dict[str, Any]) -> Batch:
             *(given["table"] or [ledger.with_suffix(".results.csv")]),
             *given["footprints"],
         ),
+        report_dir=given["report_dir"],
         config=dict(given["config"]),
     )
 

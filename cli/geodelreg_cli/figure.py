@@ -1,45 +1,73 @@
-"""The images that ``--figure`` draws the tie points on."""
+"""``geodelreg figure``: one figure, out of a JSON report and its rasters."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from geodelreg.image.reader import RasterReader
-    from geodelreg.values.raster import Band
-    from geodelreg.values.result import Alignment
+import click
 
-LONG_SIDE_PX = 1000
+from geodelreg.errors import UsageError
+from geodelreg.options import FIGURES
+from geodelreg_cli.options import (
+    SectionCommand,
+    SectionOption,
+    add_options,
+    ms_and_pan,
+    start_run,
+)
+from geodelreg_cli.report import FILE, OUTPUT, again_options, check_output
+
+EPILOG = """\
+Examples:
+
+  What the correction leaves, as arrows for a paper:
+    geodelreg align ms.tif pan.tif -o aligned.tif --report result.json
+    geodelreg figure result.json ms.tif pan.tif --kind arrows -o arrows.svg
+"""
 
 
-def bands_to_show(alignment: Alignment) -> tuple[Band, Band]:
-    """One band of MS and one of PAN, whole and averaged down to `LONG_SIDE_PX`.
+def kind_option(name: str, section: str) -> SectionOption:
+    """Option that says what a figure shows."""
+    return SectionOption(
+        [name],
+        type=click.Choice(FIGURES),
+        default="matches",
+        show_default=True,
+        section=section,
+        help="before-after: MS and PAN in turns, and one laid over the other; arrows: what the "
+        "correction leaves at the tie points; mesh: their Delaunay mesh, and rejected points by "
+        "reason; error: maps of the residual and of the standard error; matches: tie points joined "
+        "between both images, after the paper's Figure 5.",
+    )
 
-    Parameters
-    ----------
-    alignment : Alignment
-        Names the bands: of MS the one with the largest weight, unless the user chose one.
 
-    Returns
-    -------
-    tuple of Band
+@add_options(
+    [
+        kind_option("--kind", OUTPUT),
+        *again_options("FILE.png", "PNG, SVG or PDF, by the extension; - is stdout, as PNG."),
+    ]
+)
+@click.command(cls=SectionCommand, epilog=EPILOG)
+@click.argument("result", metavar="RESULT.json", type=FILE)
+@click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
+def figure(result: Path, rasters: tuple[str, ...], **given: Any) -> None:
+    """Draw one figure, out of a result and the rasters that it tells of.
+
+    RESULT.json is what "geodelreg align --report RESULT.json" has written, refused or not. MS and
+    PAN are the rasters of then; others are refused. Needs matplotlib (the report extra).
     """
-    from geodelreg.image.reader import open_raster
+    start_run(given)
+    sources, reference = ms_and_pan(rasters)
+    from geodelreg.product.figures import check_drawable
+    from geodelreg.report.again import read_again
+    from geodelreg.report.figures import draw_figure
 
-    options, weights = alignment.options, alignment.solution.band_weights
-    with (
-        open_raster(alignment.source.paths, allow=options.allow) as ms,
-        open_raster(alignment.reference.paths[0], allow=options.allow) as pan,
-    ):
-        heaviest = max(weights, key=lambda name: weights[name], default="")
-        number = ms.band_names.index(heaviest) + 1 if heaviest in ms.band_names else 1
-        return _overview(ms, options.band or number), _overview(pan, options.pan_band)
-
-
-def _overview(reader: RasterReader, number: int) -> Band:
-    from geodelreg.values.raster import Window
-
-    height, width = reader.grid.shape
-    factor = max(1.0, max(height, width) / LONG_SIDE_PX)
-    shape = max(1, round(height / factor)), max(1, round(width / factor))
-    return reader.read([number], Window(0, 0, width, height), shape)[0]
+    output = given["output"]
+    try:
+        check_drawable(output)
+    except UsageError as error:
+        raise click.UsageError(str(error)) from error
+    check_output(result, rasters, given)
+    alignment = read_again(result, sources, reference, given["allow"])
+    draw_figure(alignment, given["kind"], output, given["overwrite"])

@@ -26,8 +26,10 @@ COMMANDS = {
     "align": ("geodelreg_cli.align", "Correct the georeferencing of MS so that it fits PAN."),
     "batch": ("geodelreg_cli.batch", "Align or check many pairs, with a ledger; also on Dask."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
+    "figure": ("geodelreg_cli.figure", "Draw what a JSON report tells: before and after, arrows."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
     "pansharpen": ("geodelreg_cli.pansharpen", "Align MS, then sharpen it with PAN."),
+    "report": ("geodelreg_cli.report", "Make a page to look at out of a JSON report."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
 }
 

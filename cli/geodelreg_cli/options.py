@@ -16,27 +16,13 @@ from typing import Any, TypeVar
 import click
 
 from geodelreg.errors import UsageError
-from geodelreg.options import AlignOptions
+from geodelreg.options import UNITS, AlignOptions, flags
 from geodelreg_cli.console import configure_logging
 
 _Options = TypeVar("_Options")
 
 RUN = "Run"
-UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
 TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": click.BOOL}
-# Flags that GDAL's users know by another name than the knob's.
-FLAGS = {
-    "band": ("-b", "--band"),
-    "masks": ("--mask",),
-    "pan_masks": ("--pan-mask",),
-    "threads": ("-j", "--num-threads"),
-    "workers": ("-j", "--workers"),
-    "driver": ("--of",),
-    "creation_options": ("--co",),
-    "warp_grid": ("--grid",),
-    "resampling": ("-r", "--resampling"),
-}
-
 # What follows a flag that may be repeated, unless it is KEY=VALUE.
 METAVARS = {"masks": "FILE[=HIDE]", "pan_masks": "FILE[=HIDE]"}
 
@@ -97,12 +83,6 @@ class SectionCommand(click.Command):
         if self.epilog:
             formatter.write_paragraph()
             formatter.write(inspect.cleandoc(self.epilog) + "\n")
-
-
-def flags(knob: str) -> tuple[str, ...]:
-    """Flags of a knob: ``("--search-radius",)`` for ``search_radius_px``."""
-    bare = next((knob.removesuffix(unit) for unit in UNITS if knob.endswith(unit)), knob)
-    return FLAGS.get(knob, ("--" + bare.replace("_", "-"),))
 
 
 def knob_option(options: type, knob: str, section: str) -> SectionOption:

@@ -35,11 +35,11 @@ from geodelreg.errors import (
     AlignmentRefusedError,
     FileLockedError,
     GeodelregError,
-    OutputUnwritableError,
     PairMemoryError,
 )
 
 if TYPE_CHECKING:
+    from geodelreg.product.check import Check
     from geodelreg.values.result import Alignment
 
 _T = TypeVar("_T")
@@ -116,6 +116,7 @@ def run_task(task: Task) -> tuple[PairResult, bool]:
             result = replace(result, outcome=REFUSED, reason=refusal.cause)
             if refusal.alignment is not None:
                 result = _with_alignment(result, refusal.alignment)
+                _write_page(task, refusal.alignment)
         except GeodelregError as error:
             reason = f"{error.cause}. {error.remedy}" if error.remedy else error.cause
             result = replace(result, error=type(error).__name__, reason=reason)
@@ -142,18 +143,20 @@ def _align(task: Task, result: PairResult) -> PairResult:
     from geodelreg.batch.figures import footprint
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.provenance import provenance_tags, written_tags
+    from geodelreg.product.targets import make_folder
 
     pair = task.pair
     options = AlignOptions(**pair.align, threads=1)
     alignment = geodelreg.align(pair.sources if len(pair.sources) > 1 else pair.sources[0],
                                 pair.reference, options)  # fmt: skip
     result = _with_alignment(result, alignment)
+    _write_page(task, alignment)  # of the inputs as they are
     tags = provenance_tags(alignment)
     if task.mode == IN_PLACE:
         notes = _when_free(lambda: geodelreg.write_in_place(alignment))
         notes += _corrected_before(pair.sources, tags, alignment.verdict.outcome.value)
     else:
-        _make_folder(Path(pair.output).parent)
+        make_folder(Path(pair.output).parent)
         write = WriteOptions(**pair.write)
 
         def publish() -> list[str]:
@@ -201,6 +204,7 @@ def _check(task: Task, result: PairResult) -> PairResult:
         limit_px=task.limit_px,
     )
     result = _with_alignment(result, check.alignment)
+    _write_page(task, check.alignment, check)
     figures = {**result.figures, **check_figures(check.misalignment)}
     return replace(result, outcome=check.outcome.value, reason=check.reason, figures=figures)
 
@@ -210,6 +214,19 @@ _RUN: dict[str, Callable[[Task, PairResult], PairResult]] = {
     IN_PLACE: _align,
     CHECK: _check,
 }
+
+
+def _write_page(task: Task, alignment: Alignment, check: Check | None = None) -> None:
+    """Write the page to look at, where one is asked for; without it the pair is none the worse."""
+    if not task.page:
+        return
+    from geodelreg.product.atomic import write_text_atomically
+    from geodelreg.report.page import page
+
+    try:
+        write_text_atomically(Path(task.page), page(alignment, check), overwrite=True)
+    except GeodelregError as error:
+        logging.getLogger(__name__).warning("no page of this pair: %s", error)
 
 
 def _with_alignment(result: PairResult, alignment: Alignment) -> PairResult:
@@ -231,15 +248,6 @@ def _when_free(write: Callable[[], _T]) -> _T:
             return write()
         sleep(_LOCK_WAIT_S)
     return write()
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputUnwritableError(
-            f"{folder} cannot be made ({error.strerror})", "Choose another place."
-        ) from error
 
 
 def _is_memory(error: Exception) -> bool:

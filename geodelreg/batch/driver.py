@@ -24,7 +24,8 @@ from geodelreg.door.formats import skip_the_rest
 from geodelreg.door.names import ALL
 from geodelreg.errors import ClusterError, PairCrashedError, UsageError
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
-from geodelreg.product.targets import check_replaceable
+from geodelreg.product.targets import check_replaceable, make_folder
+from geodelreg.report.index import PAGES, page_name
 
 AnyPath = str | PathLike[str]
 Manifest = AnyPath | Iterable[Mapping[str, Any] | Row]
@@ -59,6 +60,8 @@ class Batch:
     tables : iterable of path
         Written at the end: all results as ``.csv`` or ``.parquet``, footprints as ``.geojson`` or
         ``.gpkg``.
+    report_dir : path, optional
+        Folder for pages to look at: ``index.html``, and one for each pair in ``pairs``.
     config : mapping of str to str
         Configuration options of GDAL.
 
@@ -88,6 +91,7 @@ class Batch:
         resume: bool = False,
         retry: Iterable[str] = (),
         tables: Iterable[AnyPath] = (),
+        report_dir: AnyPath | None = None,
         config: Mapping[str, str] | None = None,
     ) -> None:
         # rows are gone through more than once
@@ -97,6 +101,10 @@ class Batch:
         align = with_absolute_masks(align or AlignOptions())
         self._retry = _known_outcomes(retry)
         self._tables = [Path(path) for path in tables]
+        self._pages: Path | None = None
+        if report_dir is not None:
+            self._pages = Path(report_dir).absolute() / PAGES
+            self._tables.append(Path(report_dir) / "index.html")
         for path in self._tables:
             check_format(path)
         self._environment = _environment(align, config or {})
@@ -174,7 +182,11 @@ class Batch:
             Ledger.check_absent(self.path)
             for path in self._tables:
                 check_replaceable(path, overwrite)
+            if self._pages is not None:
+                check_replaceable(self._pages / page_name(1), overwrite)
             Ledger.create(self.path, self._kind(), self.pairs())
+        if self._pages is not None:
+            make_folder(self._pages)
         with Ledger(self.path) as ledger:
             for path in self._tables:
                 ledger.own(path)
@@ -253,6 +265,7 @@ class Batch:
             options.memory_mb,
             self._environment,
             __version__,
+            "" if self._pages is None else str(self._pages / page_name(number)),
         )
 
     def _result(

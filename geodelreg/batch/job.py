@@ -82,6 +82,8 @@ class Task:
         Variables of the process that runs the pair, beside those of the worker.
     version : str
         Of the geodelreg that planned it.
+    page : str
+        Where the page to look at goes; empty when none is made.
     """
 
     number: int
@@ -92,6 +94,7 @@ class Task:
     memory_mb: int | None
     environment: Mapping[str, str]
     version: str
+    page: str = ""
 
     def to_json(self) -> str:
         """One line of text."""

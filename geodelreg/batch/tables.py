@@ -37,12 +37,16 @@ def check_format(path: Path) -> None:
     UsageError, MissingExtraError
     """
     suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
+    if suffix not in (*_WRITERS, ".html"):
         raise UsageError(
             f"{path}: the extension says no format of tables",
-            f"Use one of: {', '.join(_WRITERS)}.",
+            f"Use one of: {', '.join((*_WRITERS, '.html'))}.",
         )
-    if suffix == ".parquet":
+    if suffix == ".html":
+        from geodelreg.report.html import check_jinja
+
+        check_jinja(path.name)
+    elif suffix == ".parquet":
         _needed("pyarrow", "parquet")
     elif suffix == ".gpkg":
         _needed("pyogrio", "vector")
@@ -55,7 +59,8 @@ def write_table(results: Iterable[PairResult], path: Path) -> None:
     ----------
     results : iterable of PairResult
     path : Path
-        The extension is the format: ``.csv``, ``.parquet``, ``.geojson`` or ``.gpkg``.
+        The extension is the format: ``.csv``, ``.parquet``, ``.geojson``, ``.gpkg``, or ``.html``
+        for a page to look at, which links those of the pairs where they lie beside it.
 
     Raises
     ------
@@ -63,7 +68,31 @@ def write_table(results: Iterable[PairResult], path: Path) -> None:
     """
     check_format(path)
     with staged(path, overwrite=True) as draft:
-        _WRITERS[path.suffix.lower()](results, draft)
+        if path.suffix.lower() == ".html":
+            draft.write_text(_index(results, path.parent), encoding="utf-8")
+        else:
+            _WRITERS[path.suffix.lower()](results, draft)
+
+
+def _index(results: Iterable[PairResult], folder: Path) -> str:
+    """A page of all results, with links to the pages of the pairs in `folder`."""
+    from geodelreg.report.index import PAGES, Row, index, page_name
+
+    def row(result: PairResult) -> Row:
+        name = f"{PAGES}/{page_name(result.number)}"
+        first, *more = result.sources
+        return Row(
+            result.number,
+            Path(first).name + (f" and {len(more)} more" if more else ""),
+            Path(result.reference).name,
+            result.outcome,
+            " ".join(text for text in (result.error, result.reason) if text),
+            result.figures,
+            result.footprint,
+            name if (folder / name).is_file() else "",
+        )
+
+    return index(map(row, results))
 
 
 def harmless(text: str) -> str:

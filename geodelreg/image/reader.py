@@ -126,6 +126,14 @@ class RasterReader:
         )
 
     @property
+    def colours(self) -> tuple[str, ...]:
+        """What GDAL takes each band for, as ``red``, ``gray`` or ``undefined``."""
+        return tuple(
+            str(self._files[band.file].dataset.colorinterp[band.number - 1].name)
+            for band in self._bands
+        )
+
+    @property
     def decimations(self) -> tuple[float, ...]:
         """Factors at which a decimated read is cheap: 1.0, then the overviews'."""
         return self._decimations

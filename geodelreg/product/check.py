@@ -163,7 +163,7 @@ def _band_dict(band: BandCheck) -> dict[str, Any]:
 
 def check_text(check: Check) -> str:
     """A few lines for people: the verdict, what it rests on, and a table of the bands."""
-    lines = [_verdict_line(check)]
+    lines = [verdict_line(check)]
     if check.alignment.verdict.accepted:
         lines += [_motion_line(check), _local_line(check)]
         lines.append(accuracy_line(check.alignment))
@@ -174,7 +174,8 @@ def check_text(check: Check) -> str:
     return "\n".join(map(shown, lines))
 
 
-def _verdict_line(check: Check) -> str:
+def verdict_line(check: Check) -> str:
+    """File, verdict and misalignment in one line."""
     name = check.source_name
     limit = f"tolerance {check.limit_px:g} PAN px"
     if check.raster_outcome is CheckOutcome.CANNOT_TELL:

@@ -72,8 +72,13 @@ def check_drawable(path: Path) -> None:
 
 
 @contextmanager
-def _figure(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
-    """Figure that is written to `path`, whole or not at all, when the block ends; PNG to ``-``."""
+def figure_file(path: Path, size_in: tuple[float, float], overwrite: bool) -> Iterator[Figure]:
+    """Figure that is written to `path`, whole or not at all, when the block ends; PNG to ``-``.
+
+    Raises
+    ------
+    MissingExtraError, UsageError, OutputExistsError, OutputUnwritableError, FileLockedError
+    """
     check_drawable(path)
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -128,7 +133,7 @@ def draw_matches(
     widths = [band.data.shape[1] / band.data.shape[0] for band, _ in sides]
     gap = 0.06 * sum(widths)
     total = sum(widths) + gap
-    with _figure(Path(path), (11.0, min(11.0 / total, 9.0) + 0.35), overwrite) as figure:
+    with figure_file(Path(path), (11.0, min(11.0 / total, 9.0) + 0.35), overwrite) as figure:
         axes = figure.add_subplot()
         if triangles is None:
             triangles = _delaunay(points.source_px, np.flatnonzero(points.kept))
@@ -222,18 +227,21 @@ def draw_before_after(
     ms_after: Band,
     path: str | Path,
     *,
+    after: str = "corrected",
     overwrite: bool = False,
 ) -> None:
     """PAN and MS woven into a checkerboard, under the original and under the corrected header.
 
-    The second row zooms into the place with the strongest edges and lays PAN (red) over MS (cyan):
-    what does not fit shows as coloured fringes.
+    The second row zooms into the place with the strongest edges and lays PAN (orange) over MS
+    (blue), colours that the colour-blind tell apart: what does not fit shows as coloured fringes.
 
     Parameters
     ----------
     pan, ms_before, ms_after : Band
         On one pixel grid: MS as it falls on PAN's pixels before and after the correction.
     path : str or Path
+    after : str
+        What MS is called after the correction.
     overwrite : bool
 
     Raises
@@ -247,14 +255,14 @@ def draw_before_after(
         raise UsageError("before/after figures need three bands of one shape")
     height, width = pan.data.shape
     rows, columns = _busiest(ms_after, max(height // 4, 16), max(width // 4, 16))
-    with _figure(Path(path), (11.0, 11.0 * height / width + 0.8), overwrite) as figure:
+    with figure_file(Path(path), (11.0, 11.0 * height / width + 0.8), overwrite) as figure:
         grid = figure.subplots(2, 2)
-        for column, (title, ms) in enumerate((("before", ms_before), ("after", ms_after))):
+        for column, (title, ms) in enumerate((("as delivered", ms_before), (after, ms_after))):
             woven, zoom = grid[0, column], grid[1, column]
             woven.imshow(_checkerboard(pan, ms), interpolation="none")
             woven.set_title(f"{title}: PAN (grey) and MS (tinted) in turns")
-            zoom.imshow(_red_cyan(pan, ms, rows, columns), interpolation="none")
-            zoom.set_title(f"{title}: zoom, PAN red over MS cyan")
+            zoom.imshow(_fringes(pan, ms, rows, columns), interpolation="none")
+            zoom.set_title(f"{title}: zoom, PAN orange over MS blue")
             _outline(woven, rows, columns)
             for axes in (woven, zoom):
                 axes.set_axis_off()
@@ -343,9 +351,9 @@ def _checkerboard(pan: Band, ms: Band) -> NDArray[Any]:
     return np.nan_to_num(image, nan=1.0)
 
 
-def _red_cyan(pan: Band, ms: Band, rows: slice, columns: slice) -> NDArray[Any]:
-    red, cyan = _grey(pan)[rows, columns], _like(ms, pan)[rows, columns]
-    return np.nan_to_num(np.stack([red, cyan, cyan], axis=-1), nan=1.0)
+def _fringes(pan: Band, ms: Band, rows: slice, columns: slice) -> NDArray[Any]:
+    one, other = _grey(pan)[rows, columns], _like(ms, pan)[rows, columns]
+    return np.nan_to_num(np.stack([one, (one + other) / 2, other], axis=-1), nan=1.0)
 
 
 def _outline(axes: Axes, rows: slice, columns: slice) -> None:

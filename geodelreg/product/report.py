@@ -17,11 +17,13 @@ from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
 from geodelreg.product.provenance import source_date
 from geodelreg.values.points import Status, TiePoints
-from geodelreg.values.raster import Grid
+from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Alignment, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.3"
+SCHEMA_VERSION = "1.4"
+LATTICE = 17
+"""Places along each axis where the standard error of the correction is listed."""
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
 """What terminals obey and JSON need not escape."""
 
@@ -64,6 +66,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "created": source_date(),
         "inputs": _inputs(alignment),
         "correction": _correction(alignment),
+        "found": _found(alignment),
         "tie_points": _tie_points(alignment.tie_points, tie_points),
         "step_counts": [
             {"step": step, "points": count}
@@ -147,6 +150,23 @@ def _correction(alignment: Alignment) -> dict[str, Any]:
     }
 
 
+def _found(alignment: Alignment) -> dict[str, Any]:
+    """The solution's map, believed or not, and how sure it is over the raster."""
+    solution, shape = alignment.solution, alignment.source.grid.shape
+    sigma = solution.map.sigma_at(lattice(shape).reshape(-1, 2))
+    return {
+        "model": solution.model,
+        "pixel_map": solution.map.to_json(),
+        "sigma_source_px": sigma.reshape(LATTICE, LATTICE),
+    }
+
+
+def lattice(shape: tuple[int, int]) -> FloatArray:
+    """(n, n, 2) float64 pixels from corner to corner of a raster of (height, width)."""
+    rows, columns = (np.linspace(0.0, size, LATTICE) for size in shape)
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
 def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
     counts = np.bincount(points.status, minlength=len(Status))
     report: dict[str, Any] = {
@@ -178,12 +198,13 @@ def summary_text(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.REFUSED:
         lines = _refused_lines(alignment)
     else:
-        lines = [_found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
-        lines.append(_next_line(alignment))
+        lines = [found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
+        lines.append(next_line(alignment))
     return "\n".join(shown(line) for line in lines if line)
 
 
-def _found_line(alignment: Alignment) -> str:
+def found_line(alignment: Alignment) -> str:
+    """How far off MS lay, in one sentence."""
     motion = header_motion(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Already aligned: the header needs no correction and stays as it is."
@@ -233,7 +254,8 @@ def masks_line(alignment: Alignment) -> str:
     return f"Masks hide: {', '.join(used)}." if used else ""
 
 
-def _next_line(alignment: Alignment) -> str:
+def next_line(alignment: Alignment) -> str:
+    """What to do with an accepted result, in one sentence."""
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
     if not alignment.fits_a_header:

@@ -97,3 +97,18 @@ def check_replaceable(target: Path, overwrite: bool, stale: Iterable[Path] = ())
         if in_the_way[0] != target:
             what = f"{in_the_way[0]} exists and would be taken for a part of {target.name}"
         raise OutputExistsError(what, "Add --overwrite to replace it, or choose another name.")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for outputs, and those above it.
+
+    Raises
+    ------
+    OutputUnwritableError
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputUnwritableError(
+            f"{folder} cannot be made ({error.strerror})", "Choose another place."
+        ) from error

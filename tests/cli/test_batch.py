@@ -25,6 +25,7 @@ from tests.cli.batch_helpers import (
     write_manifest,
 )
 from tests.cli.helpers import Command, snapshot, write_noise
+from tests.cli.pages import Page
 
 
 @pytest.fixture(scope="module")
@@ -382,3 +383,40 @@ def test_wrong_usage_is_told(folder: Path, geodelreg: Command, args: list[str], 
     assert done.returncode == 2
     assert word in done.stderr
     assert snapshot(folder) == before
+
+
+def test_pages_of_a_batch_lead_to_the_pages_of_its_pairs(folder: Path, geodelreg: Command) -> None:
+    manifest = write_manifest(folder / "pairs.csv", MIXED)
+    pages = folder / "report"
+    done = geodelreg("batch", manifest, "--report-dir", pages)
+    assert done.returncode == 1, done.stderr
+    index = Page(pages / "index.html")
+    assert outcomes(folder / "pairs.results.csv") == [
+        attributes["data-outcome"] for attributes in index.all("tr") if "data-outcome" in attributes
+    ]
+    links = [attributes["href"] for attributes in index.all("a")]
+    assert links == ["pairs/000001.html", "pairs/000002.html", "pairs/000003.html"]
+    titles = [Page(pages / link).texts["title"][0] for link in links]
+    assert titles == [
+        "Aligned: ms_1.tif on pan_1.tif",
+        "Aligned: ms_2.tif on pan_2.tif",
+        "Refused: ms_1.tif on noise.tif",
+    ]
+    # a page of then is not replaced unasked
+    (folder / "pairs.ledger").unlink()
+    (folder / "pairs.results.csv").unlink()
+    before = snapshot(folder)
+    again = geodelreg("batch", manifest, "--report-dir", pages)
+    assert again.returncode == 1
+    assert "index.html exists" in again.stderr
+    assert snapshot(folder) == before
+
+
+def test_pages_of_checks_say_what_the_checks_say(folder: Path, geodelreg: Command) -> None:
+    rows = [{name: row[name] for name in ("ms", "pan")} for row in MIXED[:1]]
+    manifest = write_manifest(folder / "pairs.csv", rows)
+    done = geodelreg("batch", manifest, "--check", "--report-dir", folder / "report")
+    assert done.returncode == 4, done.stderr
+    page = Page(folder / "report" / "pairs" / "000001.html")
+    assert page.texts["title"] == ["Misaligned: ms_1.tif on pan_1.tif"]
+    assert "Correct the header with geodelreg align." in page.text

@@ -30,6 +30,7 @@ from geodelreg.product.figures import check_drawable
 from geodelreg.product.gcps import read_gcps
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
+from geodelreg.product.reading import read_report
 from tests.integration.raster_samples import GCPS, TAGS, UTM18, correction_of, make_cog
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -171,6 +172,9 @@ CASES = {
     errors.MaskError: Case(
         lambda folder: aligned(folder, AlignOptions(masks=(str(text_file(folder, "qa.tif")),))),
         ("qa.tif",),
+    ),
+    errors.ReportError: Case(
+        lambda folder: read_report(text_file(folder, "result.json")), ("result.json",)
     ),
     errors.MissingExtraError: Case(without_matplotlib, ("matplotlib",)),
     errors.ManifestError: Case(

@@ -1,0 +1,65 @@
+"""Reports in files: for machines or to look at, by the extension of the name."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from geodelreg.product.atomic import write_text_atomically
+from geodelreg.product.report import report_json
+from geodelreg.report.html import check_jinja
+from geodelreg.values.result import Alignment
+
+_PAGES = (".html", ".htm")
+
+
+def is_page(path: Path) -> bool:
+    """True of the name of a page to look at; everything else is JSON."""
+    return path.suffix.lower() in _PAGES
+
+
+def check_report(path: Path) -> None:
+    """Refuse a report that cannot be made, before there is anything to report.
+
+    Raises
+    ------
+    MissingExtraError
+    """
+    if is_page(path):
+        check_jinja(path.name)
+
+
+def report_text(alignment: Alignment, path: Path) -> str:
+    """Text of a report: a page for ``.html``, else JSON with every tie point.
+
+    Raises
+    ------
+    MissingExtraError
+    GeodelregError
+        Its other kinds, when a page's rasters cannot be read again.
+    """
+    check_report(path)
+    if not is_page(path):
+        return report_json(alignment, tie_points=True) + "\n"
+    from geodelreg.report.page import page
+
+    return page(alignment)
+
+
+def write_report(alignment: Alignment, path: str | PathLike[str], overwrite: bool = False) -> None:
+    """Write what an alignment found out, refused or not.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        As returned by `align`, or held by `AlignmentRefusedError`.
+    path : path
+        ``.html`` for a page to look at, which reads the rasters again (needs the report extra);
+        else JSON with every tie point.  ``-`` is standard output.
+    overwrite : bool
+
+    Raises
+    ------
+    MissingExtraError, OutputExistsError, OutputUnwritableError, FileLockedError
+    """
+    write_text_atomically(Path(path), report_text(alignment, Path(path)), overwrite)

@@ -1,0 +1,97 @@
+"""What the correction leaves, as a map over the raster: smooth, and deaf to single mismatches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geodelreg.fine.layers import ELSEWHERE
+from geodelreg.report.frame import Frame
+from geodelreg.values.points import TiePoints
+from geodelreg.values.raster import BoolArray, FloatArray
+
+NEIGHBOURS = 8
+"""Points whose median is taken: three gross mismatches among them change little."""
+_CELLS = 48
+_REACH = 2.5
+"""Usual distances between neighbours beyond which nothing is said of a place."""
+
+
+def elsewhere(points: TiePoints) -> BoolArray:
+    """(M,) True for points that matched, but at another place than the correction says."""
+    return np.asarray(np.isin(points.status, ELSEWHERE) & _finite(points))
+
+
+def matched(points: TiePoints) -> BoolArray:
+    """(M,) True for points that matched anywhere, kept or not."""
+    return np.asarray((points.kept & _finite(points)) | elsewhere(points))
+
+
+def _finite(points: TiePoints) -> BoolArray:
+    return np.asarray(np.isfinite(points.residual_px).all(axis=1))
+
+
+def local_residual(points: TiePoints, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Median residual of the points around some places.
+
+    Parameters
+    ----------
+    points : TiePoints
+        At least one of them matched.
+    at : (N, 2) float64
+        PAN pixels.
+
+    Returns
+    -------
+    residual_px : (N, 2) float64
+        PAN pixels: where MS lies after the correction, less where PAN has it.
+    distance_px : (N,) float64
+        To the farthest of the points asked.
+    """
+    from scipy.spatial import cKDTree
+
+    some = np.flatnonzero(matched(points))
+    count = min(NEIGHBOURS, len(some))
+    distance, index = cKDTree(points.reference_px[some]).query(at, count)
+    near = some[np.reshape(index, (len(at), count))]
+    median = np.median(points.residual_px[near], axis=1)
+    return np.asarray(median), np.reshape(distance, (len(at), count))[:, -1]
+
+
+def cells(frame: Frame) -> FloatArray:
+    """(n, m, 2) PAN pixels at the centres of square cells that cover the frame's window."""
+    window = frame.window
+    side = max(window.width, window.height) / _CELLS
+    counts = (max(1, round(window.width / side)), max(1, round(window.height / side)))
+    x, y = (
+        start + (np.arange(count) + 0.5) * size / count
+        for start, size, count in zip(window[:2], window[2:], counts, strict=True)
+    )
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def error_map(points: TiePoints, frame: Frame) -> FloatArray:
+    """(n, m) length of the local residual in each cell, PAN pixels; NaN where none is near."""
+    at = cells(frame)
+    if not matched(points).any():
+        return np.full(at.shape[:2], np.nan)
+    flat = at.reshape(-1, 2)
+    residual, reach = local_residual(points, flat)
+    usual = np.median(local_residual(points, points.reference_px[matched(points)])[1])
+    length = np.where(reach <= _REACH * usual, np.hypot(*residual.T), np.nan)
+    return np.asarray(_on_ms(length, flat, frame).reshape(at.shape[:2]))
+
+
+def sigma_map(frame: Frame) -> FloatArray:
+    """(n, m) standard error of the correction in each cell, PAN pixels; NaN beyond MS."""
+    at = cells(frame)
+    flat = at.reshape(-1, 2)
+    there = np.nan_to_num(frame.to_ms(flat, corrected=True))
+    sigma = frame.sigma(there) * frame.pan_px_per_ms_px
+    return np.asarray(_on_ms(sigma, flat, frame).reshape(at.shape[:2]))
+
+
+def _on_ms(values: FloatArray, at: FloatArray, frame: Frame) -> FloatArray:
+    """The same where MS covers PAN, else NaN."""
+    ms = frame.to_ms(at, corrected=True)
+    inside = ((ms >= 0) & (ms <= frame.ms_size)).all(axis=1)
+    return np.where(inside, values, np.nan)

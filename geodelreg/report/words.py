@@ -1,0 +1,281 @@
+"""Plain words for what a result says."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from geodelreg.judge.words import region, remedy_of
+from geodelreg.options import AlignOptions, flags
+from geodelreg.product.check import Check, verdict_line
+from geodelreg.product.report import found_line, next_line, short, with_metres
+from geodelreg.report.residuals import elsewhere, matched
+from geodelreg.values.points import Status
+from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.result import Alignment, CheckOutcome, Outcome, Reason
+
+OUTCOMES: dict[Outcome | CheckOutcome, str] = {
+    Outcome.ALIGNED: "Aligned",
+    Outcome.ALREADY_ALIGNED: "Already aligned",
+    Outcome.REFUSED: "Refused",
+    CheckOutcome.ALIGNED: "Aligned",
+    CheckOutcome.MISALIGNED: "Misaligned",
+    CheckOutcome.CANNOT_TELL: "Cannot tell",
+}
+AFTER = {
+    Outcome.ALIGNED: "corrected",
+    Outcome.ALREADY_ALIGNED: "as measured (header kept)",
+    Outcome.REFUSED: "candidate (refused)",
+}
+"""What the corrected MS is called in pictures."""
+
+STATUS = {
+    Status.KEPT: "kept",
+    Status.RATIO: "resembles two places",
+    Status.DUPLICATE: "claims a place twice",
+    Status.COLLINEAR: "in a row with others",
+    Status.COCIRCULAR: "on a circle with others",
+    Status.TOPOLOGY: "folds the mesh",
+    Status.CONSENSUS: "matched, lies elsewhere",
+    Status.TEXTURE: "too little texture",
+    Status.CONVERGENCE: "found no match",
+    Status.CORRELATION: "looks too different",
+    Status.STAR: "matched, moves unlike its neighbours",
+    Status.RESIDUAL: "matched, far from the fit",
+}
+
+_SILENT = (Status.TEXTURE, Status.CONVERGENCE, Status.CORRELATION)
+
+
+def is_telling(status: Status) -> bool:
+    """False of points that merely showed too little to be matched."""
+    return status not in _SILENT
+
+
+REASONS = {
+    "tie_points": ("Tie points that agree", "Places seen in both images that tell the same story."),
+    "log_nfa": ("Agreement is no chance", "How often chance alone would make places agree so."),
+    "log_chance": (
+        "Likeness is no chance",
+        "Whether areas resemble each other best just where the correction puts them.",
+    ),
+    "log_together": ("Both together are no chance", "Positions and likeness at once."),
+    "coverage": ("Spread over the overlap", "Share of the common ground that tie points enclose."),
+    "sigma_px": ("Uncertainty at the worst corner", "Standard error of the correction there."),
+    "disagreement_px": ("Halves agree", "Distance between fits to two halves of the points."),
+    "rival": ("No rival place", "Likeness at the best other place over that at the found one."),
+    "rival_motion": (
+        "No rival motion",
+        "Patches that agree on another motion, for each that agrees on this one.",
+    ),
+    "support": ("Areas agree", "Share of the areas that look alike best in place."),
+    "bands_apart": (
+        "Bands agree",
+        "Distance between where two bands of MS put the ground; clouds make them differ.",
+    ),
+    "keypoints_apart": ("Keypoints agree", "Distance from where distinct features put the ground."),
+    "max_shift": ("Shift within your limit", "As asked with --max-shift."),
+    "max_rotation": ("Rotation within your limit", "As asked with --max-rotation."),
+    "max_scale": ("Scale within your limit", "As asked with --max-scale."),
+    "two_motions": (
+        "The raster moves as one",
+        "Share of the patches that lie elsewhere together: a torn mosaic, dropped rows, clouds.",
+    ),
+    "local": (
+        "One affine is enough",
+        "What one affine leaves of the ground's bend: relief, a moving sensor, dropped rows.",
+    ),
+}
+"""Of each reason of the gate: what it asks, and what it measures."""
+FAILED = {
+    "tie_points": "Too few places are recognised in both images.",
+    "log_nfa": "The places that agree could as well agree by chance.",
+    "log_chance": "The areas resemble each other no better in place than elsewhere.",
+    "log_together": "Positions and likeness together could still be chance.",
+    "coverage": "The places that agree lie together in a small part of the overlap.",
+    "sigma_px": "The correction is too uncertain at the far corner.",
+    "disagreement_px": "Two halves of the tie points tell different corrections.",
+    "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
+    "rival_motion": "A second part of the picture moves otherwise, and is nearly as large as the "
+    "part that was followed: a torn mosaic, moving clouds or ice, or steep terrain.",
+    "support": "Too many areas look alike better elsewhere than in place.",
+    "bands_apart": "The bands of MS do not lie on each other, as over clouds.",
+    "keypoints_apart": "Distinct features say another place than the patches.",
+    "max_shift": "The shift is larger than you allowed.",
+    "max_rotation": "The rotation is larger than you allowed.",
+    "max_scale": "The scale differs by more than you allowed.",
+    "two_motions": "A part of the picture lies elsewhere than the rest, as if it were torn: a "
+    "faulty mosaic, dropped rows, or moving clouds or ice.",
+    "local": "The ground is bent smoothly against PAN, as by relief or a moving sensor, and no "
+    "header can follow that.",
+}
+"""Of each reason of the gate: what it means that it failed."""
+_AT_LEAST = ("tie_points", "coverage", "support")
+_WORST = 2.0
+_WORTH_A_WORD = 0.05
+"""Of the patches that matched: fewer lie elsewhere in any good pair."""
+_WORTH_A_WORD_SILENT = 0.3
+_TOGETHER = 0.4
+"""Spread over length of displacements that are one motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A reason of the gate against its limit.
+
+    Attributes
+    ----------
+    question, meaning, message : str
+    failure : str
+        What it means that it failed.
+    passed : bool
+    used : float
+        How much of what is allowed is used up, 0 to 2: the limit is 1, and more has failed.
+    """
+
+    question: str
+    meaning: str
+    message: str
+    failure: str
+    passed: bool
+    used: float
+
+
+def bar(reason: Reason) -> Bar:
+    """The bar of a reason."""
+    question, meaning = REASONS.get(reason.name, (reason.name.replace("_", " "), ""))
+    more_is_better = reason.name in _AT_LEAST or reason.limit < 0
+    small, large = (reason.limit, reason.value) if more_is_better else (reason.value, reason.limit)
+    ratio = small / large if large else math.inf
+    if not math.isfinite(ratio) or ratio < 0:
+        ratio = 0.0 if reason.passed else _WORST
+    used = min(ratio, 1.0) if reason.passed else min(max(ratio, 1.0), _WORST)
+    failure = FAILED.get(reason.name, f"{question}: no.")
+    return Bar(question, meaning, reason.message, failure, reason.passed, used)
+
+
+def names(paths: Sequence[str]) -> str:
+    """Name of a file, or of the first of several and how many there are beside it."""
+    more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+    return Path(paths[0]).name + more
+
+
+def headline(alignment: Alignment, check: Check | None = None) -> str:
+    """The outcome in a word or two."""
+    return OUTCOMES[(check or alignment.verdict).outcome]
+
+
+def story(alignment: Alignment, check: Check | None = None) -> list[str]:
+    """The verdict, what is left and where, a sentence or two each."""
+    if check is not None:
+        told = verdict_line(check).removeprefix(f"{check.source_name}: ")
+    elif alignment.verdict.outcome is Outcome.REFUSED:
+        told = "the images do not support this alignment. Nothing was written"
+    else:
+        told = found_line(alignment).partition(": ")[2].removesuffix(".")
+    texts = [_elsewhere(alignment), _silent(alignment), _left(alignment)]
+    if alignment.verdict.accepted:
+        texts.reverse()
+    return [f"{_sentence(told)}.", *(text for text in texts if text)]
+
+
+def advice(alignment: Alignment, check: Check | None = None) -> str:
+    """What to do next."""
+    if alignment.verdict.outcome is Outcome.REFUSED:
+        return remedy_of(alignment.verdict)
+    if check is None:
+        return _sentence(next_line(alignment).removeprefix("Next: "))
+    if check.outcome is CheckOutcome.MISALIGNED:
+        return "Correct the header with geodelreg align."
+    return "Use the raster as it is."
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _left(alignment: Alignment) -> str:
+    """Residual and uncertainty."""
+    accuracy, parts = alignment.accuracy, []
+    if math.isfinite(accuracy.check_rmse_px):
+        error = with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)
+        whose = "" if alignment.verdict.accepted else "Of the part that was followed: "
+        parts.append(f"{whose}Tie points that the fit had not seen miss by {error} (RMSE).")
+    if math.isfinite(accuracy.sigma_corner_px):
+        parts.append(
+            f"The correction is known to {short(accuracy.sigma_centre_px)} PAN px at the centre "
+            f"and {short(accuracy.sigma_corner_px)} PAN px at the worst corner (standard error)."
+        )
+    rms, (low, high) = accuracy.residual_rms_px, accuracy.residual_interval_px
+    if rms > 0:
+        between = f" (95 %: {short(low)} to {short(high)})" if math.isfinite(low + high) else ""
+        parts.append(f"One affine leaves {short(rms)} PAN px RMS of the ground's bend{between}.")
+    elif high >= 0:
+        parts.append(f"One affine leaves no bend of the ground beyond {short(high)} PAN px.")
+    return " ".join(parts)
+
+
+def _elsewhere(alignment: Alignment) -> str:
+    """How many patches matched elsewhere, where they are, how far off, and whether together."""
+    points = alignment.tie_points
+    some, away = matched(points), elsewhere(points)
+    if away.sum() < _WORTH_A_WORD * some.sum() or not away.any():
+        return ""
+    off = points.residual_px[away]
+    middle = np.median(off, axis=0)
+    apart = float(np.median(np.hypot(*(off - middle).T)))
+    together = apart < _TOGETHER * float(np.hypot(*middle))
+    how = f"all alike, {direction(middle)}" if together else "in various directions"
+    return (
+        f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere, "
+        f"{short(float(np.median(np.hypot(*off.T))))} PAN px off in the median, {how}: "
+        f"{_region(alignment, some, away)} of the picture."
+    )
+
+
+def _silent(alignment: Alignment) -> str:
+    """How many patches showed too little to be matched, and where they are."""
+    status = alignment.tie_points.status
+    every = np.ones(len(status), dtype=np.bool_)
+    silent = np.isin(status, _SILENT)
+    if silent.sum() <= _WORTH_A_WORD_SILENT * len(status) or not len(status):
+        return ""
+    return (
+        f"{int(silent.sum())} of {len(status)} patches showed nothing to match, as clouds or "
+        f"water do, or were left out: {_region(alignment, every, silent)} of the picture."
+    )
+
+
+def _region(alignment: Alignment, some: BoolArray, member: BoolArray) -> str:
+    """Where some of the patches lie, in words."""
+    height, width = alignment.source.grid.shape
+    xy = alignment.tie_points.source_px[some]
+    return region(xy, member[some], (float(width), float(height)))
+
+
+def direction(residual_px: Sequence[float] | FloatArray) -> str:
+    """A displacement, right and down, in words."""
+    right, down = (float(value) for value in residual_px)
+    return (
+        f"{short(abs(right))} {'right' if right >= 0 else 'left'} and "
+        f"{short(abs(down))} {'down' if down >= 0 else 'up'}"
+    )
+
+
+def command(alignment: Alignment) -> str:
+    """The command that finds the same again and makes a report of it."""
+    defaults, options = AlignOptions(), alignment.options
+    words = ["geodelreg", "align", *alignment.source.paths, *alignment.reference.paths, "--dry-run"]
+    words += ["--report", "again.html"]
+    for field in fields(AlignOptions):
+        value = getattr(options, field.name)
+        if field.name == "threads" or value == getattr(defaults, field.name):
+            continue
+        for item in value if isinstance(value, tuple) else (value,):
+            words += [flags(field.name)[-1], str(item)]
+    return shlex.join(words)
