@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from geodelreg.coarse.guesses import guesses
+from geodelreg.coarse.header import ProvenGuess
 from geodelreg.coarse.scopes import scopes
 from geodelreg.errors import NoOverlapError
 from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.matching import patches_log_nfa, tie_points
-from geodelreg.fine.passes import Refinement, refine
+from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fit.choice import Fitted, half_disagreement, select_model
 from geodelreg.fit.models import PARAMETER_COUNT, Frame
 from geodelreg.geo.maps.affine import IDENTITY
@@ -50,8 +51,9 @@ def align_pair(
 ) -> tuple[Pair, Solution]:
     """Find the correction of the source's header, with its evidence.
 
-    Guesses come from keypoints, coarse first, then from edges around the header; each is refined
-    and judged, and the first that the evidence supports is taken.
+    Guesses come from the header's place where that leaves no doubt, from keypoints, coarse first,
+    then from edges around the header; each is refined and judged, and the first that the evidence
+    supports is taken.
 
     Parameters
     ----------
@@ -93,7 +95,8 @@ def align_pair(
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return seen, solution
-            refused.append(solution)
+            if not isinstance(guess, ProvenGuess):  # keypoints will have the last word
+                refused.append(solution)
         heard.append(Claim(guess.map, guess.log_nfa))
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
@@ -123,7 +126,10 @@ def find(pair: Pair, guess: Guess) -> Found | None:
 def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
     """Patches that agree, without those that the mesh finds out, and the map they choose."""
     with pair.timings("refine"):
-        refined = refine(roles(pair), guess)
+        if isinstance(guess, ProvenGuess):
+            refined = refine_proven(roles(pair), guess.proof)
+        else:
+            refined = refine(roles(pair), guess)
     if refined is None:
         return None
     with pair.timings("fit"):
@@ -195,6 +201,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
+        search=guess.search,
     )
 
 

@@ -21,7 +21,7 @@ from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.3"
+SCHEMA_VERSION = "1.4"
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
 """What terminals obey and JSON need not escape."""
 
@@ -65,6 +65,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "inputs": _inputs(alignment),
         "correction": _correction(alignment),
         "tie_points": _tie_points(alignment.tie_points, tie_points),
+        "search": alignment.solution.search,
         "step_counts": [
             {"step": step, "points": count}
             for step, count in alignment.solution.step_counts.items()
