@@ -79,7 +79,6 @@ def align_pair(
         When a band has no texture where it matters.
     """
     report = progress or (lambda fraction, step: None)
-    Thread(target=_load_scipy).start()
     pair = make_pair(source, reference, options, timings)
     refused: list[Solution] = []
     heard: list[Claim] = []
@@ -132,6 +131,8 @@ def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
             refined = refine(roles(pair), guess)
     if refined is None:
         return None
+    if not refined.last.is_calm:
+        Thread(target=_load_scipy).start()
     with pair.timings("fit"):
         fitted = fit_patches(pair, guess, refined, on_the_mesh(refined.last))
     return None if fitted is None else Found(guess, refined, fitted)
@@ -215,8 +216,8 @@ def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
 
 
 def _load_scipy() -> None:
-    """Load what the fit will need, half hidden behind the reading of the rasters."""
-    for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.linalg"):
+    """Load what a look at the whole raster will need, half hidden behind the evidence."""
+    for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.sparse.csgraph"):
         import_module(name)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -138,6 +140,16 @@ def test_the_search_makes_no_difference_to_the_place(standard: Scene, aligned: A
     truth = replace(standard.truth, ms_true=tuple(by_keypoints.correction.corrected)[:6])
     gap = Scene(standard.ms, standard.pan, truth).rmse_px(aligned.correction.corrected)
     assert gap < 0.003
+
+
+def test_a_calm_pair_needs_no_scipy(standard: Scene) -> None:
+    """Loading it takes longer than the search and the matching together."""
+    code = (
+        f"import sys, geodelreg; a = geodelreg.align({str(standard.ms)!r}, {str(standard.pan)!r}); "
+        "print(a.verdict.outcome.value, [name for name in sys.modules if 'scipy' in name])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split(maxsplit=1) == ["aligned", "[]\n"]
 
 
 def test_clouds_that_move_are_left_to_keypoints(tmp_path: Path) -> None:
