@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from geodelreg.coarse.guesses import guesses
+from geodelreg.coarse.header import ProvenGuess
 from geodelreg.coarse.scopes import scopes
 from geodelreg.errors import NoOverlapError
 from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.matching import patches_log_nfa, tie_points
-from geodelreg.fine.passes import Refinement, refine
+from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fit.choice import Fitted, half_disagreement, select_model
 from geodelreg.fit.models import PARAMETER_COUNT, Frame
 from geodelreg.geo.maps.affine import IDENTITY
@@ -50,8 +51,9 @@ def align_pair(
 ) -> tuple[Pair, Solution]:
     """Find the correction of the source's header, with its evidence.
 
-    Guesses come from keypoints, coarse first, then from edges around the header; each is refined
-    and judged, and the first that the evidence supports is taken.
+    Guesses come from the header's place where that leaves no doubt, from keypoints, coarse first,
+    then from edges around the header; each is refined and judged, and the first that the evidence
+    supports is taken.
 
     Parameters
     ----------
@@ -77,7 +79,6 @@ def align_pair(
         When a band has no texture where it matters.
     """
     report = progress or (lambda fraction, step: None)
-    Thread(target=_load_scipy).start()
     pair = make_pair(source, reference, options, timings)
     refused: list[Solution] = []
     heard: list[Claim] = []
@@ -93,7 +94,8 @@ def align_pair(
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return seen, solution
-            refused.append(solution)
+            if not isinstance(guess, ProvenGuess):  # keypoints will have the last word
+                refused.append(solution)
         heard.append(Claim(guess.map, guess.log_nfa))
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
@@ -123,9 +125,14 @@ def find(pair: Pair, guess: Guess) -> Found | None:
 def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
     """Patches that agree, without those that the mesh finds out, and the map they choose."""
     with pair.timings("refine"):
-        refined = refine(roles(pair), guess)
+        if isinstance(guess, ProvenGuess):
+            refined = refine_proven(roles(pair), guess.proof)
+        else:
+            refined = refine(roles(pair), guess)
     if refined is None:
         return None
+    if not refined.last.is_calm:
+        Thread(target=_load_scipy).start()
     with pair.timings("fit"):
         fitted = fit_patches(pair, guess, refined, on_the_mesh(refined.last))
     return None if fitted is None else Found(guess, refined, fitted)
@@ -195,6 +202,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
+        search=guess.search,
     )
 
 
@@ -208,8 +216,8 @@ def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
 
 
 def _load_scipy() -> None:
-    """Load what the fit will need, half hidden behind the reading of the rasters."""
-    for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.linalg"):
+    """Load what a look at the whole raster will need, half hidden behind the evidence."""
+    for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.sparse.csgraph"):
         import_module(name)
 
 

@@ -19,6 +19,7 @@ BEYOND_A_HEADER = ("projective",)
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
+SEARCHES = ("auto", "keypoints")
 EXTENTS = ("pan", "intersection")
 UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
 FLAGS = {
@@ -112,6 +113,13 @@ class AlignOptions:
         (),
         "The same for PAN. One of the two is enough for any place: a tie point needs both images.",
     )
+    search: str = _knob(
+        "auto",
+        "How delaunay finds the first guess. auto: where the header says, or a shift from there, "
+        "when nothing in the images lets one doubt it, else by SIFT keypoints; keypoints: by "
+        "keypoints alone.",
+        SEARCHES,
+    )
     search_radius_px: float = _knob(
         512.0,
         "How far off, in PAN pixels, the header may be for the first search; when that finds "
@@ -163,6 +171,7 @@ class AlignOptions:
     def __post_init__(self) -> None:
         _check_choice(self, "method")
         _check_choice(self, "model")
+        _check_choice(self, "search")
         _check_choice(self, "allow")
         _check_range(self, "band", 1, 65535)
         _check_range(self, "pan_band", 1, 65535)

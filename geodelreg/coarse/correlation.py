@@ -6,6 +6,8 @@ doi:10.1109/TIP.2011.2181402).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
@@ -19,9 +21,26 @@ _CLIP_SIGMAS = 3.0
 _ALL_VALID = 0.99  # share of a pixel, when decimated; the rest is rounding
 _LEAST_SHARE = 1e-3  # of weight: means of less are not asked for
 _LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
+_PEAK_PX = 8  # further off is another place; unexplained: ablate
 
 
-def best_shift(overlay: Overlay) -> FloatArray:
+class Shift(NamedTuple):
+    """Where edges correlate best.
+
+    Attributes
+    ----------
+    move : (2,) float64
+        (columns, rows): content of `Overlay.template` at x is that of `Overlay.surface` at x plus
+        this, to about a pixel of the overlay.
+    rival : float
+        Significance of the best other place over that of this one; near 1 = ambiguous.
+    """
+
+    move: FloatArray
+    rival: float
+
+
+def best_shift(overlay: Overlay) -> Shift:
     """Displacement at which the edges of the two images correlate most significantly.
 
     Of two displacements that of larger overlap may have the smaller correlation and yet be the less
@@ -30,23 +49,25 @@ def best_shift(overlay: Overlay) -> FloatArray:
     Parameters
     ----------
     overlay : Overlay
-
-    Returns
-    -------
-    (2,) float64
-        (columns, rows): content of `overlay.template` at x is that of `overlay.surface` at x plus
-        this, to about a pixel of the overlay.
     """
     details = detail_pair(overlay)
     (one, one_mask), (other, other_mask) = (_edges(*detail) for detail in details)
     least = _SEARCH_OVERLAP * float(min(one_mask.sum(), other_mask.sum()))
     scores, overlap = masked_correlation(one, one_mask, other, other_mask, least)
     scores *= np.sqrt(np.maximum(overlap, 0.0))
-    row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    row, column = (int(i) for i in np.unravel_index(int(np.argmax(scores)), scores.shape))
     height, width = one.shape
-    moved = np.array([width - 1 - int(column), height - 1 - int(row)], dtype=np.float64)
+    moved = np.array([width - 1 - column, height - 1 - row], dtype=np.float64)
     rows, columns = overlay.template.shape
-    return np.asarray(moved * np.array([columns / width, rows / height]))
+    best = float(scores[row, column])
+    scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
+    rival = float(scores.max()) / best if best > 0 else 1.0
+    return Shift(np.asarray(moved * np.array([columns / width, rows / height])), rival)
+
+
+def around(centre: int, reach: int) -> slice:
+    """Rows or columns no further off than `reach`."""
+    return slice(max(centre - reach, 0), centre + reach + 1)
 
 
 def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:

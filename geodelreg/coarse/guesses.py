@@ -8,24 +8,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from affine import Affine
 
-from geodelreg.coarse.correlation import best_shift
 from geodelreg.coarse.descriptors import match_descriptors, one_to_one, ratio_test
 from geodelreg.coarse.grey import to_uint8
+from geodelreg.coarse.header import edge_guess, proven_guess
 from geodelreg.coarse.keypoints import KeypointOptions, detect, no_keypoints
 from geodelreg.coarse.scopes import read_overview, scopes, working_gsd_m
 from geodelreg.errors import NoDataError
 from geodelreg.fine.layers import SURE_LOG_NFA, bright_mask, in_doubt, is_calm_guess
-from geodelreg.fine.looks import band_looks, mean_band
-from geodelreg.fine.overlay import overlay
-from geodelreg.fine.surface import make_surface
+from geodelreg.fine.looks import band_looks
 from geodelreg.fit.chance import log_nfa
 from geodelreg.fit.consensus import Consensus, consensus_keypoints, fit_plainly, radial_residuals
 from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.geo.affine import affine_matrix
-from geodelreg.geo.maps.affine import IDENTITY, AffineMap
-from geodelreg.pair import Pair, roles
+from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.pair import Pair
 from geodelreg.values.points import Guess, Keypoints, Matches, Overview, Scope, Status
 from geodelreg.values.raster import Band, BoolArray, Grid
 
@@ -38,13 +35,13 @@ _AFFINE_MATCHES = 12  # four times what an affine needs; unexplained: ablate
 _CHANCE_LOG_NFA = -2.0
 _TOGETHER_PX = 520_000  # a scale space takes some 230 bytes a pixel
 _FAIR_SHARE = 0.5
-_EDGE_SIGMA_PX = 0.5
 
 
 def guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:
     """First guesses, the most likely first; later ones are only made when asked for.
 
-    From keypoints, scope by scope, then from edges around the header.
+    From the header's place, where that leaves no doubt; from keypoints, scope by scope; then from
+    edges around the header.
 
     Yields
     ------
@@ -59,7 +56,11 @@ def guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:
     """
     first: tuple[Pair, Overview] | None = None
     for seen, images in overviews(pair, scopes(pair)):
-        first = first or (seen, images)
+        if first is None:
+            first = seen, images
+            proven = None if pair.options.search == "keypoints" else proven_guess(*first)
+            if proven is not None:
+                yield seen, proven
         for guess in keypoint_guesses(seen, images):
             yield seen, guess
     if first is not None:
@@ -118,22 +119,6 @@ def _emptiness(pair: Pair, images: Overview) -> NoDataError | None:
                 "Choose another band, or check the no-data value and the mask.",
             )
     return None
-
-
-def edge_guess(pair: Pair, images: Overview) -> Guess:
-    """The shift at which edges correlate best, for pairs whose keypoints do not match."""
-    part = roles(pair)
-    template, finer = mean_band(images.source), images.reference
-    if not part.ms_is_template:
-        template, finer = finer, template
-    surface = make_surface(finer, part.surface.grid, (_EDGE_SIGMA_PX, _EDGE_SIGMA_PX))
-    step = ~part.template.grid.transform @ template.grid.transform
-    move = best_shift(overlay(part, template, surface, IDENTITY)) * np.array([step.a, step.e])
-    if not part.ms_is_template:
-        # template pixel x shows what the surface has at x + shift: carry that to MS pixels
-        ends = part.to_surface(IDENTITY).forward(np.stack([move, np.zeros(2)]))
-        move = ends[1] - ends[0]
-    return Guess(AffineMap(Affine.translation(*move.tolist())), float("nan"), {}, images)
 
 
 def keypoint_guesses(pair: Pair, images: Overview) -> Iterator[Guess]:

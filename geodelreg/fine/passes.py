@@ -81,6 +81,27 @@ class Refinement:
         return self.tuning.sigma > _BLURRED_SIGMA and self.part.step < largest_step(self.part)
 
 
+def refine_proven(part: Roles, proof: Pass) -> Refinement | None:
+    """Passes from where patches of the decimated images agree already.
+
+    Returns
+    -------
+    Refinement or None
+        None unless nearly all patches agree in full resolution, too, and show all they could.
+    """
+    assert proof.estimate is not None
+    read = _read(part, proof.estimate.map)
+    if read is None:
+        return None
+    tiles, size = read
+    options = MatchOptions(size=size)
+    found = _approach(part, _some_of(tiles), proof.estimate.map, options, PLAIN, _PASSES, proof)
+    if found is None or not found.last.is_calm or found.is_blurred:
+        return None
+    last = _closely(part, tiles, found, options)
+    return last if last is not None and last.last.is_calm else None
+
+
 def refine(part: Roles, guess: Guess) -> Refinement | None:
     """Passes over well-spread tiles, each with better tone, point spread and map.
 
@@ -117,13 +138,24 @@ def _coarse_refinement(part: Roles, guess: Guess) -> PixelMap:
 
 
 def _refine(part: Roles, near: PixelMap, guess: Guess) -> Refinement | None:
+    read = _read(part, near)
+    return None if read is None else _of_the_ground(part, read[0], guess, near, read[1])
+
+
+def _read(part: Roles, near: PixelMap) -> tuple[list[Tile], int] | None:
+    """Tiles around a map and the side of their patches; None where nothing overlaps."""
     region = overlap_in_template(part, near)
     if region is None:
         return None
     size = patch_size(region.width * region.height / part.step**2)
     with part.pair.timings("read tiles"):
         tiles = read_tiles(part, plan_tiles(region, part), near)
-    return _of_the_ground(part, tiles, guess, near, _size_for(tiles, size)) if tiles else None
+    return (tiles, _size_for(tiles, size)) if tiles else None
+
+
+def _some_of(tiles: list[Tile]) -> list[Tile]:
+    """Some of the tiles, if those are enough for all passes but the last."""
+    return tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
 
 
 def _size_for(tiles: list[Tile], size: int) -> int:
@@ -185,7 +217,7 @@ def _passes(
     is taken.
     """
     options = MatchOptions(size=size)
-    some = tiles[::_SOME_TILES] if len(tiles) >= _MANY_TILES else tiles
+    some = _some_of(tiles)
     starts = [near, IDENTITY] if or_header else [near]
     passes = _PASSES_FROM_AFAR if or_header else _PASSES
     best: Refinement | None = None
@@ -207,21 +239,36 @@ def _passes(
     tuning, last = best.tuning, best.last
     if not last.is_calm:
         tuning, last = sharpest(part, best.tiles, (tuning, last), others, options)
-    assert last.estimate is not None
-    near = last.estimate.map
-    tuning = replace(tuning, tone=fit_tone(part, tiles, near, tuning.sigma))
+    return _closely(part, tiles, replace(best, tuning=tuning, last=last), options)
+
+
+def _closely(
+    part: Roles, tiles: list[Tile], found: Refinement, options: MatchOptions
+) -> Refinement | None:
+    """The last pass, over all tiles."""
+    near = found.estimate.map
+    tuning = replace(found.tuning, tone=fit_tone(part, tiles, near, found.tuning.sigma))
     closely = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
     last = match_pass(part, tiles, near, tuning, closely)
-    return None if last.estimate is None else Refinement(part, tiles, tuning, last, size)
+    return None if last.estimate is None else Refinement(part, tiles, tuning, last, options.size)
 
 
 def _approach(
-    part: Roles, tiles: list[Tile], near: PixelMap, options: MatchOptions, look: Look, passes: int
+    part: Roles,
+    tiles: list[Tile],
+    near: PixelMap,
+    options: MatchOptions,
+    look: Look,
+    passes: int,
+    found: Pass | None = None,
 ) -> Refinement | None:
-    """Passes towards the map and the point spread, from a start a few pixels off."""
+    """Passes towards the map and the point spread, from a start a few pixels off, or from a pass.
+
+    `found` is the first of the passes when it was made elsewhere.
+    """
     local = look.local_tone and part.ms_is_template
-    sigma, found = DEFAULT_SIGMA, None
-    for number in range(passes):
+    sigma = DEFAULT_SIGMA
+    for number in range(0 if found is None else 1, passes):
         tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness

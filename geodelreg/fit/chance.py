@@ -62,17 +62,13 @@ def log10_binomial_tail(successes: int, trials: int, probability: float) -> floa
     """log10 of P(X ≥ successes) for a binomial X, far below the smallest float too."""
     if successes <= trials * probability:
         return 0.0
-    from scipy.special import logsumexp
-
     k = np.arange(successes, trials + 1)
     odds = math.log(probability) - math.log1p(-probability)
     terms = _log_choose(trials, k) + k * odds + trials * math.log1p(-probability)
-    return min(float(logsumexp(terms)) / _LN_10, 0.0)
+    return min(float(np.logaddexp.reduce(terms)) / _LN_10, 0.0)
 
 
 def _log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
     """Natural logarithm of the numbers of ways to choose k of n."""
-    from scipy.special import gammaln
-
-    ways = gammaln(np.add(n, 1)) - gammaln(np.add(k, 1)) - gammaln(np.subtract(n, k) + 1)
-    return np.asarray(ways)
+    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, np.max(n) + 1)))])
+    return np.asarray(log_factorial[n] - log_factorial[k] - log_factorial[np.subtract(n, k)])

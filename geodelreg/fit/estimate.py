@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ _CONVERGED = 1e-9  # of half the raster: 1e-5 px of one of 20 000
 _RANK = 1e-13  # 450 times the rounding of float64
 _SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; unexplained: ablate
 _CLOSE = 1e-4  # relative: far below the error of the variance itself
+_MOST_CUTS = 50  # of an interval; five or six are usual
 _MOST_LEVERAGE = 0.95  # a residual is magnified twentyfold at most; unexplained: ablate
 
 
@@ -243,8 +245,6 @@ def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
 
 def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
     """`common_variance` from the eigenvalues and eigenvectors of the covariances."""
-    from scipy.optimize import brentq
-
     if not residual.any():
         return 0.0
     one, other = np.einsum("nji,nj->in", axes, residual) ** 2
@@ -258,7 +258,26 @@ def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray
     if not missing(0.0) > 0.0:
         return 0.0
     most = _median((residual**2).sum(axis=1)) + TINY
-    return float(brentq(missing, 0.0, most, rtol=_CLOSE))
+    return _root(missing, 0.0, most)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function that falls through 0 between two ends does, to `_CLOSE` of it.
+
+    Regula falsi that halves the value of an end which stays (Illinois: Dowell & Jarratt 1971).
+    """
+    above, below = function(low), function(high)
+    at, side = high, 0
+    for _ in range(_MOST_CUTS):
+        before, at = at, (low * below - high * above) / (below - above)
+        value = function(at)
+        if value > 0:
+            low, above, below, side = at, value, below / (2 if side > 0 else 1), 1
+        else:
+            high, below, above, side = at, value, above / (2 if side < 0 else 1), -1
+        if value == 0 or abs(at - before) <= _CLOSE * at:
+            break
+    return at
 
 
 def _median(values: FloatArray) -> float:

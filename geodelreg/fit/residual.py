@@ -9,7 +9,7 @@ import numpy as np
 
 from geodelreg.fit.field import Field
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import TINY, FloatArray
+from geodelreg.values.raster import TINY, FloatArray, IntArray
 
 _DRAWS = 400  # unexplained: ablate
 _ENDS = (2.5, 97.5)  # unexplained: ablate
@@ -102,16 +102,22 @@ def shared_by_neighbours(xy: FloatArray, residual: FloatArray) -> Residual:
     Residual
         Nothing is known from too few patches.
     """
-    from scipy.spatial import cKDTree
-
     if len(xy) < _FEWEST:
         return Residual()
     size = np.hypot(*residual.T)
     most = _BOUND * float(np.median(size))  # a few mismatches are no ground
     bounded = residual * np.minimum(most / np.maximum(size, TINY), 1.0)[:, None]
-    nearest = np.asarray(cKDTree(xy).query(xy, k=2)[1])[:, 1]
+    nearest = _nearest_others(xy)
     product = (bounded * bounded[nearest]).sum(axis=1)
     shared = float(product.mean())
     error = 2 * float(product.std() / np.sqrt(len(xy) / 2))  # most pairs count from both ends
     rms, low, high = (math.sqrt(max(v, 0.0)) for v in (shared, shared - error, shared + error))
     return Residual(rms, _P95_OVER_RMS * rms, low, high)
+
+
+def _nearest_others(xy: FloatArray) -> IntArray:
+    """(N,) which other point is nearest to each; of equally near ones the first."""
+    points = np.ascontiguousarray(xy).view(np.complex128).reshape(-1)
+    distance = np.abs(points[:, None] - points)
+    np.fill_diagonal(distance, np.inf)
+    return np.asarray(distance.argmin(axis=1))

@@ -66,7 +66,7 @@ class Star(NamedTuple):
 
 
 def delaunay(xy: FloatArray) -> IntArray:
-    """Delaunay triangulation, by Qhull.
+    """Delaunay triangulation, by GEOS.
 
     Of points at one place only the first takes part; points that are not finite do not.
 
@@ -81,15 +81,14 @@ def delaunay(xy: FloatArray) -> IntArray:
         beginning with its smallest index, in ascending order.  Empty when there are fewer than
         three places or all lie on one line.
     """
-    from scipy.spatial import Delaunay, QhullError
+    from shapely import MultiPoint, delaunay_triangles, get_coordinates
 
     places, first = _distinct_places(xy)
     if len(places) < 3:
         return np.empty((0, 3), dtype=np.intp)
-    try:
-        triangles = first[Delaunay(places - places.mean(axis=0)).simplices]
-    except QhullError:  # all on one line
-        return np.empty((0, 3), dtype=np.intp)
+    rings = get_coordinates(delaunay_triangles(MultiPoint(places))).reshape(-1, 4, 2)
+    corners = _as_complex(rings[:, :3].reshape(-1, 2))
+    triangles = first[np.searchsorted(_as_complex(places), corners)].reshape(-1, 3)
     return _in_order(triangles[twice_area(xy, triangles) != 0], xy)
 
 

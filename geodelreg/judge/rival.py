@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from geodelreg.coarse.correlation import detail_pair, masked_correlation
+from geodelreg.coarse.correlation import around, detail_pair, masked_correlation
 from geodelreg.fine.overlay import Overlay
 from geodelreg.values.raster import Float32Array, FloatArray
 
@@ -60,12 +60,8 @@ def rival_correlation(overlay: Overlay) -> float:
         by_block = by_block or _rival_blocks(one, other)
         in_blocks = by_block(middle_y - row, middle_x - column)
         rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
-        scores[_around(row, _PEAK_PX), _around(column, _PEAK_PX)] = 0.0
+        scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
     return max(rivals)
-
-
-def _around(centre: int, reach: int) -> slice:
-    return slice(max(centre - reach, 0), centre + reach + 1)
 
 
 def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int], float]:

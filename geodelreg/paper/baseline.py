@@ -69,9 +69,12 @@ def paper_scopes(pair: Pair) -> Iterator[Scope]:
 
     Each once, at the coarser ground sampling distance, or decimated to `SECOND_BUDGET_PX`.
     """
-    limits = (SECOND_BUDGET_PX, pair.options.max_keypoints, pair.options.method)
-    windows = dict.fromkeys((scope.source, scope.reference) for scope in scopes(pair))
-    return (Scope(source, reference, *limits) for source, reference in windows)
+    most, name = pair.options.max_keypoints, pair.options.method
+    windows = {(scope.source, scope.reference): scope.is_whole for scope in scopes(pair)}
+    return (
+        Scope(source, reference, SECOND_BUDGET_PX, most, name, is_whole)
+        for (source, reference), is_whole in windows.items()
+    )
 
 
 def grey_keypoints(images: Overview) -> tuple[Keypoints, Keypoints]:

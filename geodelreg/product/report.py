@@ -68,6 +68,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         "correction": _correction(alignment),
         "found": _found(alignment),
         "tie_points": _tie_points(alignment.tie_points, tie_points),
+        "search": alignment.solution.search,
         "step_counts": [
             {"step": step, "points": count}
             for step, count in alignment.solution.step_counts.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -232,6 +233,13 @@ class Guess:
     header_px: FloatArray = field(default_factory=_nowhere)
     candidates: int = 0
     bright: tuple[BoolArray, BoolArray] | None = None
+
+    @property
+    def search(self) -> str:
+        """Where it was looked for: at the header's place, or with keypoints there or everywhere."""
+        if math.isnan(self.log_nfa):
+            return "header"
+        return "whole" if self.images.scope.is_whole else "keypoints"
 
     @property
     def agreeing(self) -> int:

@@ -202,6 +202,8 @@ class Solution:
     band_weights : dict of str to float
         Bands matched on and their weights in the synthetic PAN.
     warnings : tuple of str
+    search : str
+        Which search led to it: ``header``, ``keypoints``, ``whole``; ``none`` when none did.
     """
 
     model: str
@@ -212,6 +214,7 @@ class Solution:
     step_counts: Mapping[str, int]
     band_weights: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    search: str = "none"
 
 
 @dataclass(frozen=True, slots=True)

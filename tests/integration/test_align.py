@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from pyproj import CRS
 
 from benchmarks.scenes.truth import Truth
 from geodelreg import AlignOptions, align
+from geodelreg.product.report import report_dict
 from geodelreg.values.result import Alignment, Outcome
 from tests.integration.align_scenes import (
     SAMPLE,
@@ -109,6 +112,63 @@ def test_header_errors_are_found(tmp_path: Path, name: str) -> None:
     assert alignment.correction.model == model
     warned = any("--warp" in warning for warning in alignment.warnings)
     assert warned == (model in ("similarity", "affine"))
+
+
+@pytest.mark.parametrize(
+    ("error", "search"),
+    [
+        (SHIFT(0.81, -0.63), "header"),
+        (SHIFT(45.9, -34.6), "header"),
+        (HEADER_ERRORS["rotation 36°"][0], "keypoints"),
+        (SHIFT(0.37, -256), "whole"),
+    ],
+    ids=["near", "far", "rotated", "beyond the radius"],
+)
+def test_the_report_says_which_search_led_there(tmp_path: Path, error: Affine, search: str) -> None:
+    scene = make_scene(tmp_path, replace(STANDARD, error=error))
+    alignment = align(scene.ms, scene.pan)
+    check(scene, alignment)
+    assert report_dict(alignment)["search"] == search
+
+
+def test_the_search_makes_no_difference_to_the_place(standard: Scene, aligned: Alignment) -> None:
+    by_keypoints = align(standard.ms, standard.pan, AlignOptions(search="keypoints"))
+    assert by_keypoints.solution.search == "keypoints"
+    assert by_keypoints.solution.step_counts["keypoints MS"] > 0
+    assert aligned.solution.search == "header"
+    check(standard, by_keypoints)
+    truth = replace(standard.truth, ms_true=tuple(by_keypoints.correction.corrected)[:6])
+    gap = Scene(standard.ms, standard.pan, truth).rmse_px(aligned.correction.corrected)
+    assert gap < 0.003
+
+
+def test_a_calm_pair_needs_no_scipy(standard: Scene) -> None:
+    """Loading it takes longer than the search and the matching together."""
+    code = (
+        f"import sys, geodelreg; a = geodelreg.align({str(standard.ms)!r}, {str(standard.pan)!r}); "
+        "print(a.verdict.outcome.value, [name for name in sys.modules if 'scipy' in name])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split(maxsplit=1) == ["aligned", "[]\n"]
+
+
+def test_clouds_that_move_are_left_to_keypoints(tmp_path: Path) -> None:
+    """Half of the patches lie elsewhere: the header's place is not beyond doubt."""
+
+    def clouds(ms: Pixels, pan: Pixels) -> None:
+        rng = np.random.default_rng(5)
+        spots = rng.random((6, 3)) * (0.8, 0.8, 0.12) + (0.1, 0.1, 0.08)
+        for bands, moved in ((ms, 0.0), (pan[None], 0.05)):
+            height, width = bands.shape[1:]
+            row, column = np.mgrid[:height, :width] / np.array([height, width])[:, None, None]
+            for y, x, radius in spots:
+                inside = (row - y) ** 2 + (column - x - moved) ** 2 < radius**2
+                bands[:, inside] = 9000 + 500 * np.sin(90 * row + 70 * column)[inside]
+
+    scene = make_scene(tmp_path, replace(STANDARD, change=clouds))
+    alignment = align(scene.ms, scene.pan)
+    check(scene, alignment, 0.06)
+    assert alignment.solution.search == "keypoints"
 
 
 @pytest.mark.parametrize("name", RASTERS)
