@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.fine.motions import neighbours
+from geodelreg.fit.chance import log10_binomial_tail
 from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
-_OFTEN = 0.7
-"""Probability from which patches that move count as brighter, or smoother: 0.75 to 0.89 over clouds
-and smoke, at most one of the two beyond 0.7 over waves and tears of twelve scenes."""
-_STILL = 0.65
-"""Share of the least cloudy half that must keep still: 0.70 to 0.77 over clouds; over waves 0.05 to
-0.45, for there all move."""
+_AMONG = 0.5
+"""Share of the patches that move that must lie beside one that does not: 0.6 and more over clouds;
+a part that is torn off has still neighbours along its edge alone."""
+_LOG_CHANCE = -3.0
+"""Of as many that outshine their neighbours: one alarm in a thousand pairs."""
 _PARALLAX_R2 = 0.65
 """Share of the motion that the bands' parallax must explain: 0.74 and 0.96 over real clouds, 0.43
 at most over ground, where unlike bands look different."""
@@ -28,59 +29,52 @@ class CloudLook:
 
     Attributes
     ----------
-    brighter, smoother : float
-        Probability that a patch that moves is brighter, or smoother, than one that does not
-        (Mann & Whitney 1947); one half where it makes no difference.
-    still : float
-        Share of the half of the patches that looks least like cloud that does not move.
+    among : float
+        Share of the patches that move that lie beside one that does not.
+    brighter : float
+        Share of those whose brightest pixels outshine their still neighbours'.
+    log_chance : float
+        log10 of the probability of as many by chance.
     """
 
-    brighter: float
-    smoother: float
-    still: float
+    among: float = 0.0
+    brighter: float = 0.0
+    log_chance: float = 0.0
 
     @property
     def explains(self) -> bool:
         """True when clouds are the better explanation than a bent or torn ground."""
-        return min(self.brighter, self.smoother) >= _OFTEN and self.still >= _STILL
-
-    @property
-    def tells_layers_apart(self) -> bool:
-        """True when one of two layers, whichever, looks like clouds beside the other."""
-        looks = self.brighter, self.smoother
-        return min(looks) >= _OFTEN or max(looks) <= 1.0 - _OFTEN
+        return self.among >= _AMONG and self.log_chance <= _LOG_CHANCE
 
 
-def cloud_look(moves: BoolArray, brightness: FloatArray, roughness: FloatArray) -> CloudLook:
-    """Compare the looks of patches that move against the ground with those that do not.
+def cloud_look(xy: FloatArray, moves: BoolArray, brightest: FloatArray) -> CloudLook:
+    """Compare patches that move against the ground with those beside them that do not.
+
+    A patch moves with a cloud when there is some cloud in it, so that its brightest pixels tell,
+    not its mean.  Ground is alike on both sides of a tear; between clouds it is in sight, and
+    darker.  Comparing neighbours alone leaves out that one end of a scene is brighter than the
+    other.
 
     Parameters
     ----------
+    xy : (N, 2) float64
+        Patches.
     moves : (N,) bool
-    brightness : (N,) float64
-        Mean of a patch.
-    roughness : (N,) float64
-        Contrast between neighbouring pixels over the contrast of the whole patch.
+    brightest : (N,) float64
+        Values that the brightest pixels of a patch reach.
     """
-    ground_like = _rank(brightness) - _rank(roughness)
-    least = ground_like <= np.median(ground_like)
+    pairs = neighbours(xy)
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    one, other = pairs[moves[pairs[:, 0]] & ~moves[pairs[:, 1]]].T
+    count = np.bincount(one, minlength=len(xy))
+    beside = count > 0
+    if not beside.any():
+        return CloudLook()
+    around = np.bincount(one, brightest[other], minlength=len(xy))[beside] / count[beside]
+    total, outshine = int(beside.sum()), int((brightest[beside] > around).sum())
     return CloudLook(
-        _greater(brightness[moves], brightness[~moves]),
-        1.0 - _greater(roughness[moves], roughness[~moves]),
-        float((~moves[least]).mean()) if least.any() else 0.0,
+        total / int(moves.sum()), outshine / total, log10_binomial_tail(outshine, total, 0.5)
     )
-
-
-def _rank(values: FloatArray) -> FloatArray:
-    return np.asarray(np.argsort(np.argsort(values, kind="stable"), kind="stable"), np.float64)
-
-
-def _greater(one: FloatArray, other: FloatArray) -> float:
-    """Probability that a value of `one` is greater than one of `other`."""
-    if not len(one) or not len(other):
-        return 0.5
-    rank = _rank(np.concatenate([one, other]))[: len(one)] + 1
-    return float((rank.sum() - len(one) * (len(one) + 1) / 2) / (len(one) * len(other)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

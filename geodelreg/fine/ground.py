@@ -49,8 +49,7 @@ def find_ground(
     source: FloatArray,
     target: FloatArray,
     variance_px2: FloatArray,
-    brightness: FloatArray,
-    roughness: FloatArray,
+    brightest: FloatArray,
 ) -> Ground:
     """Tell the ground from what moves differently.
 
@@ -63,12 +62,12 @@ def find_ground(
         Patches, and where they lie under the header, in pixels of the coarser image.
     variance_px2 : (N,) float64
         Trace of the covariance of `target`.
-    brightness, roughness : (N,) float64
+    brightest : (N,) float64
         As for `geodelreg.fine.clouds.cloud_look`.
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
     core = consensus_affine(source, target, variance_px2, tolerance)
-    look = cloud_look(~core.inliers, brightness, roughness)
+    look = cloud_look(source, ~core.inliers, brightest)
     if look.explains:
         return Ground(core.inliers, np.where(core.inliers, 0, -1).astype(np.intp), look)
     label = layers(source, target - source, np.sqrt(variance_px2))
@@ -79,8 +78,7 @@ def other_motions(
     source: FloatArray,
     move: FloatArray,
     label: IntArray,
-    brightness: FloatArray,
-    roughness: FloatArray,
+    brightest: FloatArray,
     textured: int,
     reach_px: float,
 ) -> list[Motion]:
@@ -96,8 +94,8 @@ def other_motions(
         Where patches were placed minus where the ground's map puts them, coarser pixels.
     label : (N,) intp
         Layers; 0 is the ground.
-    brightness, roughness : (N,) float64
-        As for `find_ground`: one of two layers that is brighter and smoother is a bank of clouds.
+    brightest : (N,) float64
+        As for `find_ground`: a layer that outshines the ground beside it is a bank of clouds.
     textured : int
         Number of all textured patches, placed or not.
     reach_px : float
@@ -116,7 +114,7 @@ def other_motions(
         if member.sum() < least or not np.hypot(*centre) > _ANOTHER_PX:
             continue
         both = member | (label == 0)
-        if not cloud_look(member[both], brightness[both], roughness[both]).tells_layers_apart:
+        if not cloud_look(source[both], member[both], brightest[both]).explains:
             found.append(Motion(member, centre))
     strays = (label < 0) & (np.hypot(*move.T) > _ANOTHER_PX)
     strip = second_motion(move, strays, _ANOTHER_PX, reach_px)

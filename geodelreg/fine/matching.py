@@ -117,9 +117,13 @@ def tie_points(
 
 
 def patches_log_nfa(part: Roles, points: TiePoints, sample_size: int) -> float:
-    """Chance agreement of patches, each of which may end anywhere within its reach."""
+    """Chance agreement of patches, each of which may end anywhere within its reach.
+
+    Those that show something and match nowhere were asked, too.
+    """
     matched = points.kept | np.isin(points.status, ELSEWHERE)
-    gap = np.hypot(*points.residual_px[matched].T)
+    asked = points.status != Status.TEXTURE
+    gap = np.where(matched, np.hypot(*points.residual_px.T), np.inf)[asked]
     reach = 2 * MAX_MOVE * part.pan_px_per_patch_px
     return log_nfa(gap, reach**2, sample_size, reach / 2)[0]
 

@@ -16,7 +16,9 @@ from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 MOST_STRAIN = 0.04
 """Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
 LEAST_SHARE = 0.05  # unexplained: ablate
-LEAST_PATCHES = 8  # unexplained: ablate
+LEAST_PATCHES = 4
+"""That agree on another motion: less than one pair in a thousand has so many by chance, and a
+raster of 40 patches has no more in a tenth of its area."""
 _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
 _SOLID = 0.9  # unexplained: ablate
@@ -52,7 +54,7 @@ def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
 
     count = len(xy)
     label = np.full(count, -1, dtype=np.intp)
-    pairs = _edges(xy)
+    pairs = neighbours(xy)
     good = _smooth(xy, move, sigma_px, pairs)
     fits = np.bincount(pairs[good].ravel(), minlength=count)
     total = np.bincount(pairs.ravel(), minlength=count)
@@ -77,8 +79,8 @@ def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
     return label
 
 
-def _edges(xy: FloatArray) -> IntArray:
-    """(E, 2) edges of the Delaunay triangulation."""
+def neighbours(xy: FloatArray) -> IntArray:
+    """(E, 2) pairs of neighbours among (N, 2) points: edges of the Delaunay triangulation."""
     from scipy.spatial import Delaunay, QhullError
 
     if len(xy) < 4:

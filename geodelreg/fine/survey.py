@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
-from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
+from geodelreg.fine.tiles import patch_size
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
 
 REACH_PX = 22
-"""Of the search; with patches of 20 pixels the windows measure 64."""
+"""Of the search; with patches of 20 pixels, the largest, the windows measure 64."""
 
-_PATCH_PX = 20  # unexplained: ablate
-_COLUMNS = 9  # of what is noted of a patch, below
+_BRIGHTEST_PERCENT = 95  # what a cloud covers of a patch that it moves, at the least
+_COLUMNS = 8  # of what is noted of a patch, below
 _LAPLACE = 6  # the norm of its kernel (Immerkær 1996)
-_LAPLACE2 = 20  # the sum of squares of the kernel of second differences
 _MOST_R = 0.999  # below 1, where Fisher's transformation ends
 _ROUNDED_R = 1.001  # above 1 by rounding; what lies beyond is flat
 _LEAST_VALID = 0.8  # unexplained: ablate
@@ -43,10 +43,8 @@ class Places:
         Absolute correlation there, and where the correction puts the patch.
     textured : (P,) bool
         The patch shows enough to be placed.
-    brightness : (P,) float64
-        Mean of the template.
-    roughness : (P,) float64
-        Contrast between neighbouring pixels of the template over the contrast of the patch.
+    brightest : (P,) float64
+        Value that one in twenty pixels of the template exceeds.
     size : int
         Side of a patch.
     """
@@ -56,8 +54,7 @@ class Places:
     score: FloatArray
     here: FloatArray
     textured: BoolArray
-    brightness: FloatArray
-    roughness: FloatArray
+    brightest: FloatArray
     size: int
 
     @property
@@ -69,17 +66,16 @@ class Places:
         return np.asarray(better * np.sqrt(independent / 2))
 
 
-def survey(overlay: Overlay, size: int = _PATCH_PX, reach: int = REACH_PX) -> Places:
+def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
     """Correlate every patch with all places up to `reach` pixels away.
 
     Parameters
     ----------
     overlay : Overlay
         The surface under the correction to be judged.
-    size : int
-        Side of a patch.
     reach : int
     """
+    size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
     surface = _filled(overlay.surface, overlay.surface_valid)
     noise = _noise(template, overlay.template_valid)
@@ -103,13 +99,13 @@ def survey(overlay: Overlay, size: int = _PATCH_PX, reach: int = REACH_PX) -> Pl
                     *(left + size / 2, top + size / 2),
                     *move,
                     *(scores[row, column], scores[reach, reach]),
-                    *(_sigma(patch, noise), float(patch.mean()), _roughness(patch)),
+                    *(_sigma(patch, noise), float(np.percentile(patch, _BRIGHTEST_PERCENT))),
                 ]
             )
     found = np.array(rows).reshape(-1, _COLUMNS)
     centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
-    score, here, sigma, brightness, roughness = rest
-    return Places(centre, move, score, here, sigma < _LARGEST_SIGMA_PX, brightness, roughness, size)
+    score, here, sigma, brightest = rest
+    return Places(centre, move, score, here, sigma < _LARGEST_SIGMA_PX, brightest, size)
 
 
 def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:
@@ -132,14 +128,6 @@ def _sigma(patch: Float32Array, noise: float) -> float:
     xx, yy, xy = (float(v) for v in (across @ across, down @ down, across @ down))
     least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
     return noise / float(np.sqrt(least)) if least > 0 else np.inf
-
-
-def _roughness(patch: Float32Array) -> float:
-    """Of neighbouring pixels' second differences to the whole patch, standard deviations."""
-    inner = patch[1:-1, 1:-1]
-    around = patch[:-2, 1:-1] + patch[2:, 1:-1] + patch[1:-1, :-2] + patch[1:-1, 2:]
-    fine = float(np.sqrt(np.mean((4 * inner - around) ** 2) / _LAPLACE2))
-    return fine / max(float(patch.std()), TINY)
 
 
 def _peak(scores: Float32Array, row: int, column: int) -> FloatArray:

@@ -27,6 +27,8 @@ def rival_correlation(overlay: Overlay) -> float:
     Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
     that the images alone cannot tell.  Rivals are the displacements at which the whole correlates
     best; they are judged block by block, so that fields of inverted contrast do not cancel out.
+    Near the place a rival is one of opposite contrast, on one side only: where one image is shaded
+    like relief and the other is not, both sides of a slope fit as well, and neither is right.
 
     Returns
     -------
@@ -47,8 +49,10 @@ def rival_correlation(overlay: Overlay) -> float:
     in_place = float(here.max())
     if in_place <= 0:
         return float("inf")
-    near = slice(middle_y - _NEAR_PX, middle_y + _NEAR_PX + 1)
-    scores[near, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1] = 0.0
+    near = np.s_[
+        middle_y - _NEAR_PX : middle_y + _NEAR_PX + 1, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1
+    ]
+    scores[near] = _one_sided(signed[near])
     rivals: list[float] = []
     by_block: Callable[[int, int], float] | None = None
     for _ in range(_RIVALS):
@@ -62,6 +66,19 @@ def rival_correlation(overlay: Overlay) -> float:
         rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
         scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
     return max(rivals)
+
+
+def _one_sided(signed: Float32Array) -> Float32Array:
+    """Correlation of opposite sign to that in the middle, beyond what the other side has too.
+
+    Of images that are alike it is even: side lobes come in pairs.
+    """
+    middle = signed.shape[0] // 2
+    around = signed[middle - 1 : middle + 2, middle - 1 : middle + 2]
+    row, column = np.unravel_index(int(np.abs(around).argmax()), around.shape)
+    opposite = np.maximum(-signed * np.sign(around[row, column]), 0.0)
+    mirrored = np.roll(opposite[::-1, ::-1], (2 * (row - 1), 2 * (column - 1)), axis=(0, 1))
+    return np.asarray(np.maximum(opposite - mirrored, 0.0), dtype=np.float32)
 
 
 def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int], float]:

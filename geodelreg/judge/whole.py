@@ -148,7 +148,7 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
         return _bent(refined, correction, agreed)
     at, move = places.centre[index], places.move[index]
     doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
-    ground = find_ground(at, at + move, doubt, places.brightness[index], places.roughness[index])
+    ground = find_ground(at, at + move, doubt, places.brightest[index])
     if ground.look.explains:
         return replace(agreed, clouds=float((~ground.member).mean()))
     to_full = ~part.template.grid.transform @ template.grid.transform
@@ -221,8 +221,8 @@ def _other_motion(
     part, at, move = refined.part, places.centre[index], places.move[index]
     apart = move - np.median(move[ground.member], axis=0)
     textured = int(places.textured.sum())
-    looks = places.brightness[index], places.roughness[index]
-    motions = other_motions(at, apart, ground.label, *looks, textured, REACH_PX)
+    bright = places.brightest[index]
+    motions = other_motions(at, apart, ground.label, bright, textured, REACH_PX)
     if not motions:
         return 0.0, ""
     motion = motions[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jsonschema
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import geodelreg
 from benchmarks.gate.bent_cases import BentPair
-from benchmarks.gate.distortions import Tear, waves
+from benchmarks.gate.distortions import Tear, gradient_contrast, relief_shading, waves
 from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
 from geodelreg import Alignment, AlignOptions
@@ -24,6 +24,7 @@ from geodelreg.values.result import CheckOutcome
 
 SHAPE = (640, 640)
 SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=2.0)
+CLOUDY = replace(SPEC, name="cloudy 1", variant="clouds")
 
 
 def still(xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -42,10 +43,13 @@ class Made:
         return float(np.sqrt((self.pair.errors(transform) ** 2).sum(axis=1).mean()))
 
 
-def made(folder: Path, bend: Bend) -> Made:
-    scene = make_scene(SPEC, sample_imagery(), bend)
-    write_scene(scene, folder)
-    return Made(folder / "ms.tif", folder / "pan.tif", BentPair(scene, bend))
+def made(folder: Path, bend: Bend, spec: SceneSpec = SPEC) -> Made:
+    return written(folder, BentPair(make_scene(spec, sample_imagery(), bend), bend))
+
+
+def written(folder: Path, pair: BentPair) -> Made:
+    write_scene(pair.scene, folder)
+    return Made(folder / "ms.tif", folder / "pan.tif", pair)
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +115,32 @@ def test_check_calls_both_misaligned(wavy: Made, torn: Made) -> None:
         assert found.outcome is CheckOutcome.MISALIGNED
         jsonschema.validate(check_dict(found), report_schema())
     assert "16 px left and 12 px down of the rest" in found.reason
+
+
+def test_a_raster_of_a_few_patches_is_not_torn_in_silence(tmp_path: Path) -> None:
+    small = replace(SPEC, pan_shape=(360, 360), ms_shape=(82, 82), ratio=4.0)
+    torn = made(tmp_path, Tear((3.0, 20.0), 0.4, 0.0, small.pan_shape), small)
+    assert "two_motions" in failed(refusal(torn)[1])
+
+
+def test_ground_between_clouds_is_aligned_and_their_share_told(tmp_path: Path) -> None:
+    cloudy = written(tmp_path, BentPair(make_scene(CLOUDY, sample_imagery())))
+    alignment = geodelreg.align(cloudy.ms, cloudy.pan)
+    assert cloudy.rms_px(alignment.correction.corrected) < 0.1
+    assert any("look like clouds" in warning for warning in alignment.warnings)
+
+
+def test_an_image_shaded_like_relief_has_two_places_and_is_refused(tmp_path: Path) -> None:
+    scene = make_scene(SPEC, sample_imagery())
+    shaded = replace(scene, ms=relief_shading(scene.ms, np.random.default_rng(3)))
+    _, alignment = refusal(written(tmp_path, BentPair(shaded)))
+    assert "rival" in failed(alignment)
+
+
+def test_a_few_patches_of_many_that_agree_are_chance(tmp_path: Path) -> None:
+    scene = make_scene(SPEC, sample_imagery())
+    edges = written(tmp_path, BentPair(replace(scene, ms=gradient_contrast(scene.ms))))
+    assert refusal(edges)[1].verdict.reasons
 
 
 def test_where_one_affine_is_the_truth_hardly_anything_is_left(tmp_path: Path) -> None:

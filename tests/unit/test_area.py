@@ -105,6 +105,24 @@ def test_fields_of_inverted_contrast_do_not_make_a_rival() -> None:
     assert rival_correlation(overlay(image, turned)) < 0.7
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_image_shaded_like_relief_fits_on_both_sides_of_its_slopes(axis: int) -> None:
+    """The derivative of an image resembles it best where it does not lie."""
+    image = texture(7)[:SIZE, :SIZE]
+    shaded = np.gradient(image, axis=axis)
+    places = [np.roll(shaded, step, axis=axis) for step in range(1, 8)]
+    best = max(places, key=lambda there: float(np.corrcoef(there.ravel(), image.ravel())[0, 1]))
+    assert rival_correlation(overlay(image, best)) > 0.85
+
+
+def test_furrows_have_valleys_on_both_sides_and_no_rival() -> None:
+    noise = np.random.default_rng(8).standard_normal((SIZE, SIZE))
+    steps = np.arange(-12, 13)
+    furrow = np.cos(2 * np.pi * steps / 10) * np.exp(-((steps / 4) ** 2) / 2)
+    image = ndimage.gaussian_filter1d(ndimage.convolve1d(noise, furrow, axis=1), 1.5, axis=0)
+    assert rival_correlation(overlay(image, image)) < 0.6
+
+
 def test_unrelated_images_have_rivals() -> None:
     view = overlay(texture(5)[:SIZE, :SIZE], texture(6)[:SIZE, :SIZE])
     assert rival_correlation(view) > 0.85
