@@ -270,10 +270,10 @@ def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatA
     weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
     for round_number in range(_ROUNDS):
         total = max(float(trust.sum()), TINY)
-        trusted = rows * trust
-        mean = trusted.sum(axis=1) / total
+        mean = (rows * trust).sum(axis=1) / total
+        apart = rows - mean[:, None]  # first: values that are far from 0 would leave only rounding
         # einsum, for BLAS would wake its threads for products as thin as these
-        second = np.einsum("bn,cn->bc", trusted, rows) - total * np.multiply.outer(mean, mean)
+        second = np.einsum("bn,cn->bc", apart * trust, apart)
         gram, moment, power = second[:-1, :-1], second[:-1, -1], float(second[-1, -1])
         weights = non_negative_weights(gram, moment)
         energy = float(weights @ gram @ weights)

@@ -159,3 +159,19 @@ def test_a_pixel_is_valid_where_every_weighted_band_is() -> None:
     only = single_band(4, 3)(made)
     assert np.array_equal(only.data, x[3])
     assert np.array_equal(only.valid, masks[3])
+
+
+@pytest.mark.parametrize("scale", [1e12, 1e30, 3e38])
+@pytest.mark.parametrize("broken", [1, 2, 3])
+def test_values_near_the_largest_are_no_error(scale: float, broken: int) -> None:
+    """Damaged files hold such; where they are constant only rounding would be left of them."""
+    rng = np.random.default_rng(0)
+    bands = rng.normal(size=(4, 2000)).astype(np.float32)
+    for number in range(broken):
+        bands[number] = scale * (rng.random(2000) < 0.5)
+    bands[3] = bands[0]
+    target = bands[2] + rng.normal(size=2000).astype(np.float32)
+    weights, correlation = robust_band_weights(bands, target)
+    assert np.isfinite(weights).all()
+    assert (weights >= 0).all()
+    assert 0 <= correlation <= 1 + 1e-9
