@@ -31,7 +31,7 @@ from qgis.core import (
 )
 from qgis.PyQt.QtCore import QVariant
 
-from geodelreg_qgis.base import MS, PAN, GeodelregAlgorithm, folded, helped
+from geodelreg_qgis.base import MS, PAN, GeodelregAlgorithm, fill, folded, helped
 from geodelreg_qgis.loading import ResultGroup
 from geodelreg_qgis.tie_points import TiePoint, read_tie_points
 
@@ -136,11 +136,13 @@ class _Aligning(GeodelregAlgorithm):
             mesh = QgsGeometry.fromMultiPointXY(places).delaunayTriangulation()
             geometries = iter(mesh.asGeometryCollection())
             rows = [[]] * len(mesh.asGeometryCollection())
+        features = []
         for geometry, row in zip(geometries, rows):
             feature = QgsFeature(fields)
             feature.setGeometry(geometry)
             feature.setAttributes(row)
-            sink.addFeature(feature)
+            features.append(feature)
+        fill(sink, features)
         return layer
 
     def load_together(

@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 
 from processing.core.ProcessingConfig import ProcessingConfig
 from qgis.core import (
+    QgsFeature,
+    QgsFeatureSink,
     QgsMapLayer,
     QgsMapLayerType,
     QgsProcessing,
@@ -59,6 +61,19 @@ def helped(
     """The same parameter with a help text."""
     parameter.setHelp(text)
     return parameter
+
+
+def fill(sink: QgsFeatureSink, features: Iterable[QgsFeature]) -> None:
+    """Write features, all of them.
+
+    Raises
+    ------
+    QgsProcessingException
+        When one cannot be written.
+    """
+    for feature in features:
+        if not sink.addFeature(feature):
+            raise QgsProcessingException(f"A feature cannot be written: {sink.lastError()}")
 
 
 def source_of(layer: QgsMapLayer) -> Source:
