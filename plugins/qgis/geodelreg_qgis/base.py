@@ -34,7 +34,7 @@ from qgis.PyQt.QtGui import QIcon
 from geodelreg_qgis.command import CommandError, Finished, check_version, find_command, run
 from geodelreg_qgis.messages import reason, sort_line
 from geodelreg_qgis.options import Command, Option, load_commands
-from geodelreg_qgis.sources import Source, SourceError, file_of
+from geodelreg_qgis.sources import Source, SourceError, check_pair, file_of
 
 COMMAND_SETTING = "GEODELREG_COMMAND"
 HERE = Path(__file__).parent
@@ -166,7 +166,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
         """Look at the layers in the thread that owns them."""
         self._files = self.files(parameters, context)
         for layer in self._layers(MS, parameters, context)[:1]:
-            self.ms_crs, self.ms_layer = layer.crs(), layer.id()
+            self.ms_crs, self.ms_id, self.ms_name = layer.crs(), layer.id(), layer.name()
         return True
 
     # --- for the algorithms -----------------------------------------------------------------------
@@ -286,6 +286,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
             for name in (MS, MORE, PAN, MASK, PAN_MASK):
                 layers = self._layers(name, parameters, context)
                 found[name] = [file_of(source_of(layer)) for layer in layers]
+            check_pair([*found[MS], *found[MORE]], found[PAN])
         except SourceError as error:
             raise QgsProcessingException(str(error)) from error
         return found
