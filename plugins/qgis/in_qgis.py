@@ -300,6 +300,7 @@ def refusals(folder: Path) -> None:
         (tried(MS=other), "in QGIS only"),
         (tried(MASK=[memory]), "kept in memory"),
         (tried(MS=str(folder / "noise.tif")), "Refused: "),
+        (tried(PAN=pair["MS"]), "as MS and as PAN"),
         (tried(OUTPUT=pair["MS"]), "ms 1.tif"),
         (tried(OUTPUT=str(folder / "no" / "folder.tif")), "folder"),
     ):

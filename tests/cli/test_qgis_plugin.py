@@ -30,7 +30,7 @@ from geodelreg_qgis.command import (
 from geodelreg_qgis.environment import bundled_wheel, find_python, make_environment
 from geodelreg_qgis.messages import reason, sort_line
 from geodelreg_qgis.options import Commands, load_commands
-from geodelreg_qgis.sources import Source, SourceError, file_of
+from geodelreg_qgis.sources import Source, SourceError, check_pair, file_of
 from geodelreg_qgis.tie_points import read_tie_points
 from tests.cli.helpers import ROOT, Command, snapshot, write_noise
 
@@ -316,6 +316,12 @@ def test_lines_of_the_log() -> None:
 def test_layers_that_are_no_plain_files_are_refused(source: Source, message: str) -> None:
     with pytest.raises(SourceError, match=f"“a”.*{message}"):
         file_of(source)
+
+
+def test_a_raster_is_not_its_own_reference() -> None:
+    check_pair(["/a.tif", "/b.tif"], ["/c.tif"])
+    with pytest.raises(SourceError, match=r"b\.tif is chosen as MS and as PAN"):
+        check_pair(["/a.tif", "/b.tif"], ["/b.tif"])
 
 
 def test_layers_that_are_files() -> None:

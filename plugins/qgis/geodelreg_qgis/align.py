@@ -31,7 +31,7 @@ from qgis.core import (
 )
 from qgis.PyQt.QtCore import QVariant
 
-from geodelreg_qgis.base import MS, PAN, GeodelregAlgorithm, folded, helped
+from geodelreg_qgis.base import MS, PAN, GeodelregAlgorithm, fill, helped
 from geodelreg_qgis.loading import ResultGroup
 from geodelreg_qgis.tie_points import TiePoint, read_tie_points
 
@@ -75,10 +75,8 @@ class _Aligning(GeodelregAlgorithm):
             (REPORT, "Report", "JSON (*.json)"),
         ):
             self.addParameter(
-                folded(
-                    QgsProcessingParameterFileDestination(
-                        name, label, files, optional=True, createByDefault=False
-                    )
+                QgsProcessingParameterFileDestination(
+                    name, label, files, optional=True, createByDefault=False
                 )
             )
         self.addOutput(QgsProcessingOutputString(OUTCOME, "Outcome"))
@@ -136,23 +134,22 @@ class _Aligning(GeodelregAlgorithm):
             mesh = QgsGeometry.fromMultiPointXY(places).delaunayTriangulation()
             geometries = iter(mesh.asGeometryCollection())
             rows = [[]] * len(mesh.asGeometryCollection())
+        features = []
         for geometry, row in zip(geometries, rows):
             feature = QgsFeature(fields)
             feature.setGeometry(geometry)
             feature.setAttributes(row)
-            sink.addFeature(feature)
+            features.append(feature)
+        fill(sink, features)
         return layer
 
     def load_together(
-        self, rasters: Iterable[str], results: dict[str, Any], context: QgsProcessingContext
+        self, rasters: dict[str, str], results: dict[str, Any], context: QgsProcessingContext
     ) -> None:
-        """Have the results loaded with names and styles, in a group."""
-        title = Path(self.rasters[0]).stem
-        group = ResultGroup(f"geodelreg: {title}", self.rasters[0], self.ms_layer)
-        for raster in rasters:
-            group.load(
-                context, raster, f"{Path(raster).stem if len(self.rasters) > 2 else title}, aligned"
-            )
+        """Have the results loaded with names and styles, in a group; rasters by file."""
+        group = ResultGroup(f"geodelreg: {self.ms_name}", self.rasters[0], self.ms_id)
+        for raster, name in rasters.items():
+            group.load(context, raster, f"{name}, aligned")
         group.load(context, results[MESH], "Mesh", "mesh.qml")
         group.load(context, results[TIE_POINTS], "Tie points", "tie_points.qml")
 
@@ -191,7 +188,7 @@ class Align(_Aligning):
         output = self.parameterAsOutputLayer(parameters, OUTPUT, context)
         where = ["--output", output] if output else ["--dry-run"]
         results = self.align(where, parameters, context, feedback)
-        self.load_together([output] if output else [], results, context)
+        self.load_together({output: self.ms_name} if output else {}, results, context)
         return {**results, OUTPUT: output or None}
 
 
@@ -235,5 +232,5 @@ class AlignBands(_Aligning):
         for layer in layers:
             details = QgsProcessingContext.LayerDetails(Path(layer).stem, context.project(), OUTPUT)
             context.addLayerToLoadOnCompletion(layer, details)
-        self.load_together(layers, results, context)
+        self.load_together({layer: Path(layer).stem for layer in layers}, results, context)
         return {**results, OUTPUT: folder, "LAYERS": layers}

@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 
 from processing.core.ProcessingConfig import ProcessingConfig
 from qgis.core import (
+    QgsFeature,
+    QgsFeatureSink,
     QgsMapLayer,
     QgsMapLayerType,
     QgsProcessing,
@@ -32,7 +34,7 @@ from qgis.PyQt.QtGui import QIcon
 from geodelreg_qgis.command import CommandError, Finished, check_version, find_command, run
 from geodelreg_qgis.messages import reason, sort_line
 from geodelreg_qgis.options import Command, Option, load_commands
-from geodelreg_qgis.sources import Source, SourceError, file_of
+from geodelreg_qgis.sources import Source, SourceError, check_pair, file_of
 
 COMMAND_SETTING = "GEODELREG_COMMAND"
 HERE = Path(__file__).parent
@@ -59,6 +61,19 @@ def helped(
     """The same parameter with a help text."""
     parameter.setHelp(text)
     return parameter
+
+
+def fill(sink: QgsFeatureSink, features: Iterable[QgsFeature]) -> None:
+    """Write features, all of them.
+
+    Raises
+    ------
+    QgsProcessingException
+        When one cannot be written.
+    """
+    for feature in features:
+        if not sink.addFeature(feature):
+            raise QgsProcessingException(f"A feature cannot be written: {sink.lastError()}")
 
 
 def source_of(layer: QgsMapLayer) -> Source:
@@ -151,7 +166,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
         """Look at the layers in the thread that owns them."""
         self._files = self.files(parameters, context)
         for layer in self._layers(MS, parameters, context)[:1]:
-            self.ms_crs, self.ms_layer = layer.crs(), layer.id()
+            self.ms_crs, self.ms_id, self.ms_name = layer.crs(), layer.id(), layer.name()
         return True
 
     # --- for the algorithms -----------------------------------------------------------------------
@@ -271,6 +286,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
             for name in (MS, MORE, PAN, MASK, PAN_MASK):
                 layers = self._layers(name, parameters, context)
                 found[name] = [file_of(source_of(layer)) for layer in layers]
+            check_pair([*found[MS], *found[MORE]], found[PAN])
         except SourceError as error:
             raise QgsProcessingException(str(error)) from error
         return found

@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from qgis.core import (
+    QgsFeature,
+    QgsField,
+    QgsFields,
     QgsProcessing,
     QgsProcessingContext,
     QgsProcessingException,
@@ -21,8 +24,9 @@ from qgis.core import (
     QgsProcessingParameterString,
     QgsVectorLayer,
 )
+from qgis.PyQt.QtCore import QVariant
 
-from geodelreg_qgis.base import GeodelregAlgorithm, folded, helped
+from geodelreg_qgis.base import GeodelregAlgorithm, fill, folded, helped
 from geodelreg_qgis.loading import load
 from geodelreg_qgis.messages import reason
 
@@ -129,12 +133,25 @@ class Batch(GeodelregAlgorithm):
     ) -> str | None:
         """Copy the footprints to where the user wants them; their name for QGIS."""
         found = QgsVectorLayer(str(file), "footprints", "ogr")
+        numbers = (QVariant.Type.Int, QVariant.Type.LongLong, QVariant.Type.Double)
+        fields = QgsFields()  # lists become text, which every format can hold
+        for field in found.fields():
+            kind = field.type() if field.type() in numbers else QVariant.Type.String
+            fields.append(QgsField(field.name(), kind))
         sink, layer = self.parameterAsSink(
-            parameters, FOOTPRINTS, context, found.fields(), found.wkbType(), found.crs()
+            parameters, FOOTPRINTS, context, fields, found.wkbType(), found.crs()
         )
         if sink is None:
             return None
-        for feature in found.getFeatures():
-            sink.addFeature(feature)
+        features = []
+        for footprint in found.getFeatures():
+            feature = QgsFeature(fields)
+            feature.setGeometry(footprint.geometry())
+            values = footprint.attributes()
+            feature.setAttributes(
+                ["; ".join(map(str, v)) if isinstance(v, list) else v for v in values]
+            )
+            features.append(feature)
+        fill(sink, features)
         load(context, layer, "Footprints", "footprints.qml")
         return str(layer)

@@ -104,12 +104,13 @@ class ResultGroup:
                 continue  # removed meanwhile
             if self._group is None:
                 self._group = root.insertGroup(0, self._title)
+            parent = self._group
             if isinstance(node.layer(), QgsRasterLayer):
-                parent, place = self._before_and_after(project, node.layer()), 0
-            else:
-                parent, place = self._group, 0
-            parent.insertChildNode(place, node.clone())
+                parent = self._before_and_after(project, node.layer())
+            parent.insertChildNode(0, node.clone())
             node.parent().removeChildNode(node)
+            if self._flip is not None:
+                self._flip.setIsMutuallyExclusive(True, 0)
 
     def _before_and_after(self, project: QgsProject, after: QgsRasterLayer) -> QgsLayerTreeGroup:
         """Group of the raster as it is and as it was; only one of the two is seen at a time."""
@@ -126,5 +127,4 @@ class ResultGroup:
         self._flip = self._group.addGroup("After / before")
         project.addMapLayer(was, False)
         self._flip.addLayer(was)
-        self._flip.setIsMutuallyExclusive(True, 0)
         return self._flip

@@ -12,8 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_COMMON = frozenset({"model", "on_local", "warp", "limit_px", "per_band", "check", "no_align"})
-"""Options that are offered at first sight; the others are folded."""
+_COMMON = {
+    "model": "Model of the correction",
+    "on_local": "Where one affine is not enough",
+    "warp": "Resample onto a north-up grid",
+    "limit_px": "Misalignment that still counts as aligned",
+    "per_band": "Also tell of each band by itself",
+    "check": "Verdicts only, write no rasters",
+    "resume": "Go on with an existing ledger",
+    "no_align": "Do not align first",
+}
+"""Options that are offered at first sight, and their labels; the others are folded."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +55,8 @@ class Option:
 
     @property
     def label(self) -> str:
-        """What the dialog calls it: its flag in words."""
-        words = self.flag.lstrip("-").replace("-", " ")
+        """What the dialog calls it: for the folded ones, the flag in words."""
+        words = _COMMON.get(self.name, self.flag.lstrip("-").replace("-", " "))
         return f"{words[0].upper()}{words[1:]}" + (f" [{self.unit.lower()}]" if self.unit else "")
 
     @property

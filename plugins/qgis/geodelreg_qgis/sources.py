@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 _SAVE = "Save it to a file (right-click the layer ▸ Export ▸ Save As…), and choose that file."
@@ -55,6 +56,18 @@ class Source:
     file_crs: str = ""
     unsaved: bool = False
     filter: str = ""
+
+
+def check_pair(ms: Sequence[str], pan: Sequence[str]) -> None:
+    """Refuse a raster as its own reference: QGIS offers the active layer for both.
+
+    Raises
+    ------
+    SourceError
+    """
+    for file in pan:
+        if file in ms:
+            raise SourceError(f"{file} is chosen as MS and as PAN. Choose the other layer.")
 
 
 def file_of(source: Source) -> str:
