@@ -19,7 +19,7 @@ from geodelreg.knobs import PansharpenKnobs
 from geodelreg.options import PansharpenOptions, check_header_holds
 from geodelreg.pair import Progress
 from geodelreg.product.atomic import together
-from geodelreg.product.common_grid import Sharpening, SpectralFile
+from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
 from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.values.result import Alignment, Correction
@@ -77,6 +77,7 @@ def pansharpen(
         files = [_spectral_file(path, alignment, allow) for path in paths]
         bands = spectral_bands(files, options.given_bands())
         what = Sharpening(files, Path(reference), pan_band, bands)
+        check_finer(what)
         weights = _weights(what, options)
         tags = {} if alignment is None else provenance_tags(alignment)
         write_pansharpened(what, Path(target), weights, tags, options, progress)

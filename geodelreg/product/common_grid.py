@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -13,10 +14,10 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.door.opening import open_raster
-from geodelreg.errors import NoOverlapError
+from geodelreg.errors import NoOverlapError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.geo.grid import outline
+from geodelreg.geo.grid import gsd_px_m, outline
 from geodelreg.product import metadata
 from geodelreg.product.header import Provenance
 from geodelreg.product.view import corrected_view
@@ -24,6 +25,7 @@ from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction
 
+_ROUNDING = 1e-3  # of pixel sizes in unlike CRSs
 _EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRSs are curved
 
 
@@ -106,6 +108,26 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     width, height = (int(n) for n in last - first)
     moved = pan.transform @ Affine.translation(*map(float, first))
     return Grid(moved, (height, width), grid.crs_wkt)
+
+
+def check_finer(what: Sharpening) -> None:
+    """Refuse PAN whose pixels are larger than those of MS: there is nothing to sharpen with.
+
+    Raises
+    ------
+    UsageError
+    """
+    with open_raster(what.reference) as pan:
+        grid = Grid(pan.transform, pan.shape, pan.crs.to_wkt())
+    for file in what.sources:
+        own = Grid(file.correction.corrected, file.shape, file.correction.crs_wkt)
+        mine, others = (math.prod(gsd_px_m(one)) ** 0.5 for one in (own, grid))
+        if others > mine * (1 + _ROUNDING):
+            raise UsageError(
+                f"the pixels of PAN ({what.reference.name}, {others:.3g} m) are larger than those "
+                f"of MS ({file.path.name}, {mine:.3g} m)",
+                "Give the finer raster last: geodelreg pansharpen MS PAN.",
+            )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -384,3 +385,20 @@ def test_chunks_of_dask_are_not_computed_for_every_window() -> None:
     blocks = int(np.prod(counted.data.numblocks))
     geodelreg.align(MS, counted)
     assert blocks <= computed <= 2 * blocks
+
+
+def test_the_package_that_type_checkers_read_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, of_files: geodelreg.Alignment
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    survey = importlib.import_module("survey")
+    found = survey.place(MS, PAN, tmp_path / "out.tif")
+    assert (found.right_px, found.down_px) == pytest.approx(of_files.shift_px, abs=0.1)
+    assert found.lines
+    assert "does not exist" in survey.place(MS, tmp_path / "none.tif", tmp_path / "out.tif")
+    pixels, grid = placed_array(PAN)
+    placed = survey.place_array(plain(), pixels[0], grid.transform, grid.crs_wkt)
+    assert placed.rio.transform().almost_equals(of_files.correction.corrected, 1e-7)
+    survey.sharpen(MS, PAN, tmp_path / "sharp.tif")
+    with rasterio.open(tmp_path / "sharp.tif") as dataset:
+        assert dataset.shape == pixels.shape[1:]

@@ -259,6 +259,14 @@ def test_what_cannot_be_is_refused_and_nothing_written(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ms.tif", "pan.tif"]
 
 
+def test_pan_must_be_the_finer_one(tmp_path: Path) -> None:
+    ms, pan = ramps(tmp_path, 2, (0.0, 0.0)), flat_pan(tmp_path, 60, 60)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(UsageError, match=r"PAN \(ms.tif, 2 m\) are larger .* MS \(pan.tif, 1 m\)"):
+        geodelreg.pansharpen(pan, ms, tmp_path / "sharp.tif")
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def test_inputs_stay_and_ground_must_be_shared(tmp_path: Path) -> None:
     ms, pan = ramps(tmp_path, 2, (0.0, 0.0)), flat_pan(tmp_path, 60, 60)
     with pytest.raises(OutputIsInputError):
