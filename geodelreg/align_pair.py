@@ -21,7 +21,7 @@ from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, passes, verdict
 from geodelreg.judge.whole import Whole, look_at_whole
-from geodelreg.judge.words import warnings_of
+from geodelreg.judge.words import bands_warning, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
@@ -180,6 +180,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
                     whole = whole.under(pair, fitted.map)
             accuracy, evidence = whole.added_to(accuracy, evidence)
             notes = whole.warnings(options)
+        notes += bands_warning(evidence)
         spots = pair.source_lattice(LATTICE)
         move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
         sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px

@@ -17,7 +17,6 @@ from geodelreg.errors import (
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
-from geodelreg.judge.words import remedy_of
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
@@ -105,7 +104,7 @@ def align(
         raise AlignmentRefusedError(
             f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
             + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),
-            remedy_of(alignment.verdict),
+            alignment.verdict.remedy,
             alignment,
         )
     return alignment

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import as_allowed
-from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError, UsageError
 from geodelreg.image.input_files import input_files
 from geodelreg.image.reader import open_raster
 from geodelreg.masking import parse_mask
@@ -51,6 +51,8 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
 
     Raises
     ------
+    AlignmentRefusedError
+        Of an alignment that was refused: there is no correction to write.
     OutputExistsError, OutputIsInputError, OutputUnwritableError, LossyOutputError, ...
         Nothing is then changed on disk.
     """
@@ -60,6 +62,7 @@ def write(alignment: Alignment, target: AnyPath, options: WriteOptions | None = 
     from geodelreg.product.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
+    _check_accepted(alignment)
     options = options or WriteOptions()
     if options.georef != "gcps":
         check_header_holds(alignment.options.model)
@@ -99,6 +102,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.atomic import tidy, together
     from geodelreg.product.inplace import edit_in_place
 
+    _check_accepted(alignment)
     check_header_holds(alignment.options.model)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
@@ -151,9 +155,21 @@ def export_gcps(
     from geodelreg.product.atomic import together
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
+    _check_accepted(alignment)
     gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
     with together(inputs=lambda: _inputs(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
+
+
+def _check_accepted(alignment: Alignment) -> None:
+    """Write nothing of a refused alignment: its map is no correction."""
+    if not alignment.verdict.accepted:
+        name = Path(alignment.source.paths[0]).name
+        raise AlignmentRefusedError(
+            f"the alignment of {name} was refused: there is no correction to write",
+            alignment.verdict.remedy,
+            alignment,
+        )
 
 
 def input_paths(names: Iterable[str], allow: str) -> list[Path]:
