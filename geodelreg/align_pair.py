@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from threading import Thread
@@ -29,6 +30,8 @@ from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, Solution, Timings
 
 _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
+_TILT_PX = 0.1
+"""Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _FEWEST_POINTS = 4
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
 
@@ -142,7 +145,8 @@ def fit_patches(
         return None
     negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
     frame, model = Frame.of(pair), pair.options.model
-    selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
+    tilt = math.inf if pair.options.north_up else _TILT_PX / pair.pan_px_per_source_px
+    selection = select_model(points, frame, pair.source_lattice(2), model, negligible, tilt)
     estimate = selection.estimate
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     tied = tie_points(part, last.matched, estimate.map, status)
