@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from threading import Thread
@@ -22,7 +23,7 @@ from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, passes, verdict
 from geodelreg.judge.whole import Whole, look_at_whole
-from geodelreg.judge.words import warnings_of
+from geodelreg.judge.words import bands_warning, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
@@ -30,6 +31,8 @@ from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, Solution, Timings
 
 _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
+_TILT_PX = 0.1
+"""Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _FEWEST_POINTS = 4
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
 
@@ -149,7 +152,8 @@ def fit_patches(
         return None
     negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
     frame, model = Frame.of(pair), pair.options.model
-    selection = select_model(points, frame, pair.source_lattice(2), model, negligible)
+    tilt = math.inf if pair.options.north_up else _TILT_PX / pair.pan_px_per_source_px
+    selection = select_model(points, frame, pair.source_lattice(2), model, negligible, tilt)
     estimate = selection.estimate
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     tied = tie_points(part, last.matched, estimate.map, status)
@@ -187,6 +191,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
                     whole = whole.under(pair, fitted.map)
             accuracy, evidence = whole.added_to(accuracy, evidence)
             notes = whole.warnings(options)
+        notes += bands_warning(evidence)
         spots = pair.source_lattice(LATTICE)
         move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
         sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px

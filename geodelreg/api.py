@@ -20,7 +20,6 @@ from geodelreg.image.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.image.reader import RasterReader, check_band, open_raster
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
-from geodelreg.judge.words import remedy_of
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
@@ -142,7 +141,7 @@ def align(
         raise AlignmentRefusedError(
             f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
             + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),
-            remedy_of(alignment.verdict),
+            alignment.verdict.remedy,
             alignment,
         )
     return alignment

@@ -96,6 +96,11 @@ class AlignOptions:
         "projective one: control points do.",
         MODELS,
     )
+    north_up: bool = _knob(
+        False,
+        "Never rotate or shear, whatever it would gain. Without it, model auto does when a corner "
+        "moves by 0.1 PAN pixels or more, and held-out points ask for it.",
+    )
     band: int | None = _knob(
         None,
         "MS band to match on, from 1; auto weights the bands so that together they look like PAN.",
@@ -186,6 +191,11 @@ class AlignOptions:
         _check_range(self, "max_scale", 1, 1e3)
         _check_range(self, "max_residual_px", 0, 1e6)
         _check_choice(self, "on_local")
+        if self.north_up and self.model not in ("auto", "shift", "scale"):
+            raise UsageError(
+                f"north_up and model = {self.model} exclude each other",
+                "Use auto, shift or scale.",
+            )
         _check_range(self, "threads", 0, 1024)
 
 

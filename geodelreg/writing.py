@@ -11,7 +11,7 @@ from typing import Unpack
 
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import as_allowed
-from geodelreg.errors import OutputUnwritableError, UsageError
+from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError, UsageError
 from geodelreg.image.input_files import input_files
 from geodelreg.image.reader import open_raster
 from geodelreg.knobs import WriteKnobs
@@ -60,6 +60,8 @@ def write(
 
     Raises
     ------
+    AlignmentRefusedError
+        Of an alignment that was refused: there is no correction to write.
     OutputExistsError, OutputIsInputError, OutputUnwritableError, LossyOutputError, ...
         Nothing is then changed on disk.
     """
@@ -69,6 +71,7 @@ def write(
     from geodelreg.product.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
+    _check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
     check_is_file(alignment)
     if options.georef != "gcps":
@@ -109,6 +112,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.atomic import tidy, together
     from geodelreg.product.inplace import edit_in_place
 
+    _check_accepted(alignment)
     check_header_holds(alignment.options.model)
     check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
@@ -162,9 +166,21 @@ def export_gcps(
     from geodelreg.product.atomic import together
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
+    _check_accepted(alignment)
     gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
     with together(inputs=lambda: _inputs(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
+
+
+def _check_accepted(alignment: Alignment) -> None:
+    """Write nothing of a refused alignment: its map is no correction."""
+    if not alignment.verdict.accepted:
+        name = Path(alignment.source.paths[0]).name
+        raise AlignmentRefusedError(
+            f"the alignment of {name} was refused: there is no correction to write",
+            alignment.verdict.remedy,
+            alignment,
+        )
 
 
 def input_paths(names: Iterable[str], allow: str) -> list[Path]:

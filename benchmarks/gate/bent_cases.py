@@ -33,6 +33,7 @@ from benchmarks.gate.distortions import (
 from benchmarks.scenes.imagery import Imagery
 from benchmarks.scenes.make import Bend, HeaderError, Scene, SceneSpec, make_scene
 from benchmarks.scenes.truth import Truth, apply, check_points
+from geodelreg.fine.tiles import SMALLEST_PATCH_PX
 
 SOURCES_HELD_OUT = ("landsat8_kanto", "landsat8_guangdong", "landsat_geographic_2020")
 """Their pairs are aligned to judge a finished method, and looked at by nobody before:
@@ -49,6 +50,8 @@ FRAMED = tuple(f"another scene, {what}" for what in ("collar", "labels", "stripe
 KINDS = (*BENT, *ONE_AFFINE, *FRAMED)
 PAN_SIDE_PX = (700, 1000)
 MOST_STRAIN = 0.04
+TORN_PATCHES = 8
+"""Of 12 MS pixels square: of a smaller part nobody could tell whether it is torn off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +164,7 @@ def make_bent(case: BentCase, data: Path) -> BentPair:
     if case.kind == "waves":
         return _bent(spec, imagery, _waves(side, rng))
     if case.kind == "tear":
-        return _bent(spec, imagery, _tear(spec.pan_shape, rng))
+        return _bent(spec, imagery, _tear(spec, rng))
     if case.kind == "bands apart":
         return _apart(spec, imagery, rng)
     if case.kind in FRAMED:
@@ -201,12 +204,13 @@ def _waves(side: int, rng: np.random.Generator) -> Bend:
     return waves(amplitude, length, rng)
 
 
-def _tear(shape: tuple[int, int], rng: np.random.Generator) -> Tear:
-    """2 to 40 px, 10 to 50 % of the area, half of them at a slant."""
+def _tear(spec: SceneSpec, rng: np.random.Generator) -> Tear:
+    """2 to 40 px, 10 to 50 % of the area and some patches at least, half of them at a slant."""
     length, angle = float(np.exp(rng.uniform(np.log(2), np.log(40)))), rng.uniform(0, 2 * np.pi)
     shift = (length * float(np.cos(angle)), length * float(np.sin(angle)))
     slant = float(rng.choice([0.0, rng.uniform(20, 70)]))
-    return Tear(shift, float(rng.uniform(0.1, 0.5)), slant, shape)
+    least = TORN_PATCHES * SMALLEST_PATCH_PX**2 / (spec.ms_shape[0] * spec.ms_shape[1])
+    return Tear(shift, max(float(rng.uniform(0.1, 0.5)), least), slant, spec.pan_shape)
 
 
 def _apart(spec: SceneSpec, imagery: Imagery, rng: np.random.Generator) -> BentPair:

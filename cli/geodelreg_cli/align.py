@@ -175,7 +175,8 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     sources, reference = ms_and_pan(rasters)
     ways = [given["output"] is not None, given["in_place"], given["dry_run"]]
     if sum(ways) != 1:
-        raise click.UsageError("Say where the result goes: one of -o OUT, --in-place, --dry-run.")
+        what = "Say where the result goes" if not any(ways) else "The result goes to one place"
+        raise click.UsageError(f"{what}: one of -o OUT, --in-place, --dry-run.")
     write_options = build(WriteOptions, given)
     if given["in_place"] and write_options not in (WriteOptions(), WriteOptions(overwrite=True)):
         raise click.UsageError(
@@ -291,7 +292,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
         _write(alignment, request)
         _write_texts(reports, request)
     if not request.quiet:
-        click.echo(summary_text(alignment), err=True)
+        click.echo(summary_text(alignment, request.write_options), err=True)
         click.echo(_step_counts(alignment), err=True)
 
 

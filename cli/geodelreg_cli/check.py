@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 VERDICT, MEASUREMENT = "Verdict", "How to measure"
 MISALIGNED = 4
 RUNS = ("threads", "allow")
-JUDGED = {"tolerance_px": 0.0, "max_residual_px": 0.5, "on_local": "warn"}
+JUDGED = {"tolerance_px": 0.0, "max_residual_px": 0.5, "on_local": "warn", "north_up": False}
 """By --tolerance, in the place of what `align` has."""
 
 EPILOG = """\

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -54,8 +53,6 @@ CLEARLY = 0.8  # of the standard error; unexplained: ablate
 
 _RIVAL_TOLERANCE = 0.2  # of a patch pixel; unexplained: ablate
 _RIVAL_SIGMA = 0.5
-_BAND_SHARE = 0.5
-_SURE_SIGMAS = 3.0
 SURE_LOG_NFA = -12.0  # as sure as 40 bits; unexplained: ablate
 _MANY_ELSEWHERE = 0.3  # share of the patches that matched; unexplained: ablate
 
@@ -301,36 +298,6 @@ def rival_motion(points: TiePoints, unit_px: float) -> float:
         return 0.0 if kept else float("inf")
     gap = np.hypot(*(rest[:, None] - rest[None]).transpose(2, 0, 1))
     return float((gap <= tolerance).sum(axis=1).max()) / kept
-
-
-def bands_apart(passes: Sequence[Pass], at: FloatArray) -> float:
-    """How far apart two bands put the ground by themselves, beyond their standard errors.
-
-    The detectors of a pushbroom sensor see a place one band after the other, from slightly
-    different directions.  The bands are made to agree on the ground, so what lies high above it,
-    or moves, is elsewhere in each: clouds contradict themselves, the ground does not.
-
-    Parameters
-    ----------
-    passes : sequence of Pass
-        Each of one band alone.
-    at : (1, 2) float64
-        Centre of the MS raster.
-
-    Returns
-    -------
-    float
-        MS pixels between the two bands that are furthest apart; 0 where fewer than two match as
-        many patches as half of what the best one does.
-    """
-    found = [(p.kept, p.estimate.map) for p in passes if p.estimate is not None]
-    enough = _BAND_SHARE * max((kept for kept, _ in found), default=0)
-    seen = [(float(m.sigma_at(at)[0]), m.forward(at)[0]) for kept, m in found if kept >= enough]
-    apart = [
-        float(np.hypot(*(here - there))) - _SURE_SIGMAS * float(np.hypot(one, other))
-        for (one, here), (other, there) in combinations(seen, 2)
-    ]
-    return max([0.0, *apart])
 
 
 class Claim(NamedTuple):

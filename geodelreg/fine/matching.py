@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -128,28 +130,55 @@ def patches_log_nfa(part: Roles, points: TiePoints, sample_size: int) -> float:
     return log_nfa(gap, reach**2, sample_size, reach / 2)[0]
 
 
+class BandPass(NamedTuple):
+    """What one MS band says by itself.
+
+    Attributes
+    ----------
+    band : int
+        Its place among the bands that are matched on, from 0.
+    found : Pass
+    """
+
+    band: int
+    found: Pass
+
+
 def match_bands(
-    part: Roles, tiles: list[Tile], correction: PixelMap, tuning: Tuning, size: int, pool: Executor
-) -> list[Pass]:
-    """Some of the MS bands, each matched by itself, over some of the tiles; of one band none.
+    part: Roles, tiles: list[Tile], tuning: Tuning, size: int, correction: PixelMap, pool: Executor
+) -> list[BandPass]:
+    """Some of the MS bands, evenly spread, each matched by itself; of one band none.
 
     Parameters
     ----------
-    part, tiles, correction, tuning
-        As for `match_pass`.
-    size : int
-        Side of a patch.
+    part, tiles, tuning, size, correction
+        As for `match_band`.
     pool : Executor
         Each band takes one of its threads.
     """
     count = len(part.pair.source_bands)
+    spread = np.linspace(0, count - 1, min(count, _BANDS)).round()
+    one = partial(match_band, part, tiles, tuning, size, correction)
+    return list(pool.map(one, map(int, spread if count > 1 else [])))
+
+
+def match_band(
+    part: Roles, tiles: list[Tile], tuning: Tuning, size: int, correction: PixelMap, band: int
+) -> BandPass:
+    """One MS band matched by itself, over some of the tiles, with one thread.
+
+    Parameters
+    ----------
+    part, tiles, tuning, correction
+        As for `match_pass`.
+    size : int
+        Side of a patch.
+    band : int
+        From 0.
+    """
     some = tiles[:: max(len(tiles) // _BAND_TILES, 1)]
     every = sample_step([tile.template[0] for tile in some], size, _BAND_PATCHES)
     options = MatchOptions(size=size, tolerance=ROUGH_STEP, every=every)
-
-    def by_itself(band: int) -> Pass:
-        alone = replace(tuning, tone=single_band(count, band), local_tone=False)
-        return match_pass(part, some, correction, alone, options, threads=1)
-
-    spread = np.linspace(0, count - 1, min(count, _BANDS)).round()
-    return list(pool.map(by_itself, map(int, spread if count > 1 else [])))
+    tone = single_band(len(part.pair.source_bands), band)
+    alone = replace(tuning, tone=tone, local_tone=False)
+    return BandPass(band, match_pass(part, some, correction, alone, options, threads=1))

@@ -27,6 +27,7 @@ _SIGNIFICANT_T = 2.5  # a chance of 1 % or so with as many blocks
 _NORTH_UP_LOSS = 0.04  # unexplained: ablate
 _LOSS = 0.01  # unexplained: ablate
 _LEAST_PREDICTED = 0.5
+_DOUBT_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,10 +93,20 @@ def held_out(model: str, points: Observations, estimate: Estimate) -> HeldOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """The chosen model, and its errors at points it has not seen."""
+    """The chosen model, and its errors at points it has not seen.
+
+    Attributes
+    ----------
+    estimate : Estimate
+    check : HeldOut
+    neglected_px : float
+        Source pixels by which rotation and shear, that are likely but not worth it, would move the
+        worst corner.
+    """
 
     estimate: Estimate
     check: HeldOut
+    neglected_px: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +139,12 @@ class Fitted:
 
 
 def select_model(
-    points: Observations, frame: Frame, corners: FloatArray, model: str, negligible_px: float
+    points: Observations,
+    frame: Frame,
+    corners: FloatArray,
+    model: str,
+    negligible_px: float,
+    tilt_px: float = 0.0,
 ) -> Selection:
     """Fit one model, or choose the simplest whose held-out error is not significantly worse.
 
@@ -142,12 +158,23 @@ def select_model(
         A model's name, or ``auto``.
     negligible_px : float
         Models that nowhere differ by more than this many source pixels count as equal.
+    tilt_px : float
+        A model that rotates or shears must move a corner by so many source pixels against the best
+        one that does not; infinite for none.
     """
     if model != "auto":
         estimate = robust_fit(model, points, frame)
         return Selection(estimate, held_out(model, points, estimate))
     candidates = [name for name in MODEL_ORDER if len(points) >= minimum_points(name)]
-    full = robust_fit(candidates[-1], points, frame)
+    full, neglected = robust_fit(candidates[-1], points, frame), 0.0
+    level = [name for name in candidates if name in NORTH_UP]
+    if level:
+        upright = robust_fit(level[-1], points, frame)
+        tilt = np.hypot(*(upright.map.forward(corners) - full.map.forward(corners)).T)
+        if tilt.max() < tilt_px:
+            doubt = _DOUBT_SIGMAS * full.map.sigma_at(corners)
+            neglected = float(np.sqrt(np.maximum(tilt**2 - doubt**2, 0.0)).max())
+            candidates, full = level, upright
     check_full = held_out(candidates[-1], points, full)
     blocks = spatial_blocks(points.source)
     for name in candidates[:-1]:
@@ -161,8 +188,8 @@ def select_model(
             or _as_good(check, check_full, _NORTH_UP_LOSS if name in NORTH_UP else _LOSS)
         ):
             estimate = robust_fit(name, points, frame)
-            return Selection(estimate, held_out(name, points, estimate))
-    return Selection(full, check_full)
+            return Selection(estimate, held_out(name, points, estimate), neglected)
+    return Selection(full, check_full, neglected)
 
 
 def _as_good(simple: HeldOut, full: HeldOut, loss: float) -> bool:

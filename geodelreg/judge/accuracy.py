@@ -47,7 +47,9 @@ def measure(
         before_rmse_m=_rms(unmoved) * pan_m,
         sigma_centre_px=math.hypot(ratio * _sigma(selection, pair.source_centre), floor),
         sigma_corner_px=math.hypot(
-            ratio * _sigma(selection, overlap_corners(part, correction)), floor
+            ratio * _sigma(selection, overlap_corners(part, correction)),
+            ratio * selection.neglected_px,
+            floor,
         ),
         coverage=_coverage(part, points, correction),
         e1_before=grey_rmse(before, part.ms_is_template),

@@ -8,8 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from geodelreg.fine.layers import Claim, bands_apart, keypoints_apart, rival_motion
-from geodelreg.fine.matching import match_bands
+from geodelreg.fine.layers import Claim, keypoints_apart, rival_motion
 from geodelreg.fine.overlay import Overlay, overlay, widened
 from geodelreg.fine.passes import COARSE_SIGMA, Refinement
 from geodelreg.fine.surface import Surface, make_surface
@@ -18,6 +17,7 @@ from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
+from geodelreg.judge.bands import bands_apart, find_bands
 from geodelreg.judge.in_place import area_evidence
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.judge.verdict import Evidence
@@ -57,7 +57,7 @@ def gather(
     where = (part, refined.tiles, correction, refined.tuning, refined.size)
     with ThreadPoolExecutor(pair.threads) as pool:
         whole = pool.submit(overlaid)
-        apart_px = bands_apart(match_bands(*where, pool), pair.source_centre)
+        apart = bands_apart(find_bands(guess, refined, correction, pool), pair)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)
@@ -76,7 +76,9 @@ def gather(
         scale=scale,
         rival_motion=rival_motion(fitted.points, part.pan_px_per_patch_px),
         support=area.support,
-        bands_apart=apart_px * pair.pan_px_per_source_px / part.pan_px_per_patch_px,
+        bands_apart=apart.distance_px * pair.pan_px_per_source_px / part.pan_px_per_patch_px,
+        bands=apart.distance_px * pair.pan_px_per_source_px,
+        bands_words=apart.words,
         keypoints_apart=keypoints_apart(pair, guess, heard, correction, fitted.points),
     )
 

@@ -38,6 +38,8 @@ _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
 SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
 SIGNIFICANCE = 3.0
+MAX_BANDS_PX = 1.0
+"""Between two MS bands: no one correction is right for both to half a PAN pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,11 @@ class Evidence:
         Share of the textured patches that agree on another motion than the ground's.
     words : str
         Where those lie.
+    bands : float
+        PAN pixels between where two MS bands, each by itself, put the ground, beyond their standard
+        errors.
+    bands_words : str
+        Which bands, and how they lie.
     """
 
     points: int
@@ -98,6 +105,8 @@ class Evidence:
     residual_low_px: float = 0.0
     moved: float = 0.0
     words: str = ""
+    bands: float = 0.0
+    bands_words: str = ""
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -114,8 +123,10 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         ("max_scale", "≤", options.max_scale, "scale factor"),
     )
     where = f": {evidence.words}" if evidence.words else ""
+    which = f": {evidence.bands_words}" if evidence.bands_words else ""
     most_px = options.max_residual_px if options.on_local == "refuse" else None
     whole = (
+        ("bands", "≤", MAX_BANDS_PX, f"PAN px at least between the places of two MS bands{which}"),
         ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
         ("local", "≤", most_px, "PAN px RMS at least is left by one affine of the ground's bend"),
     )

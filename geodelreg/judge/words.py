@@ -6,13 +6,14 @@ import numpy as np
 
 from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
 from geodelreg.fit.choice import spatial_blocks
+from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
-from geodelreg.values.result import Verdict
 
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
+_BANDS_TOLD_PX = 0.5  # of PAN: half of what refuses
 _MOSTLY = 0.9  # unexplained: ablate
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
@@ -50,7 +51,7 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
     if model in ("similarity", "affine"):
         notes.append(
             "the correction rotates the raster: its geotransform is no longer north-up, which "
-            "GDAL's pansharpening and gdalbuildvrt refuse; --warp resamples it north-up"
+            "GDAL's pansharpening and gdalbuildvrt refuse"
         )
     local = local_distortion(points)
     if local > LOCAL_RMS_PX:
@@ -92,6 +93,16 @@ def local_distortion(points: TiePoints) -> float:
     return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))
 
 
+def bands_warning(evidence: Evidence) -> tuple[str, ...]:
+    """What to say of MS bands that lie apart; nothing of bands that agree."""
+    if not evidence.bands > _BANDS_TOLD_PX:
+        return ()
+    note = (
+        f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least)"
+    )
+    return (f"{note}; the correction is not right for both, --band N matches on one",)
+
+
 def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
     """Where some of the patches lie, in words: "the lower 45 %", "the right 20 %", "a part at …".
 
@@ -122,29 +133,9 @@ def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
     return f"{share} in the {where}"
 
 
-def lies(move_px: FloatArray) -> str:
+def lies(move_px: FloatArray, rest: str = "the rest") -> str:
     """Where a part lies that is (2,) PAN pixels right and down of the rest, in words."""
     right, down = (float(v) for v in move_px)
     across = f"{abs(right):.2g} px {'right' if right >= 0 else 'left'}"
     along = f"{abs(down):.2g} px {'down' if down >= 0 else 'up'}"
-    return f"lies {across} and {along} of the rest"
-
-
-def remedy_of(verdict: Verdict) -> str:
-    """What can be done about a refusal."""
-    failed = {reason.name for reason in verdict.reasons if not reason.passed}
-    if failed == {"local"}:
-        return (
-            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
-            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
-            "part by part."
-        )
-    if "two_motions" in failed and failed <= {"two_motions", "local"}:
-        return (
-            "Mask the part that moves (--mask), or cut the raster there (gdal_translate -srcwin) "
-            "and align each part."
-        )
-    return (
-        "Check that both show the same ground; try --band with the band that looks most like PAN, "
-        "a larger --search-radius, or a simpler --model."
-    )
+    return f"lies {across} and {along} of {rest}"

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from geodelreg.errors import shown
+from geodelreg.options import WriteOptions
 from geodelreg.product.motion import header_motion
 from geodelreg.product.provenance import source_date
 from geodelreg.values.points import Status, TiePoints
@@ -191,16 +192,22 @@ def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
     return report
 
 
-def summary_text(alignment: Alignment) -> str:
+def summary_text(alignment: Alignment, written: WriteOptions | None = None) -> str:
     """A few lines for people: what was found, how good it is, what to do next.
 
     Warnings are not repeated here.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    written : WriteOptions, optional
+        How the raster was written, if it was.
     """
     if alignment.verdict.outcome is Outcome.REFUSED:
         lines = _refused_lines(alignment)
     else:
         lines = [found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
-        lines.append(next_line(alignment))
+        lines.append(next_line(alignment, written))
     return "\n".join(shown(line) for line in lines if line)
 
 
@@ -218,7 +225,8 @@ def found_line(alignment: Alignment) -> str:
     if alignment.correction.model in ("scale", "similarity", "affine"):
         parts.append(f"scale × {width:.6f} by × {height:.6f}")
     if alignment.correction.model in ("similarity", "affine"):
-        parts.append(f"turned {motion.rotation_deg:+.4f}° counterclockwise")
+        way = "clockwise" if motion.rotation_deg < 0 else "counterclockwise"
+        parts.append(f"turned {abs(motion.rotation_deg):.4f}° {way}")
     if alignment.correction.model == "affine":
         parts.append(f"shear {motion.shear_deg:+.4f}°")
     return (
@@ -255,12 +263,17 @@ def masks_line(alignment: Alignment) -> str:
     return f"Masks hide: {', '.join(used)}." if used else ""
 
 
-def next_line(alignment: Alignment) -> str:
+def next_line(alignment: Alignment, written: WriteOptions | None = None) -> str:
     """What to do with an accepted result, in one sentence."""
+    written = written or WriteOptions()
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
     if not alignment.fits_a_header:
         return "Next: no geotransform holds this correction: pass control points on (--gcps)."
+    if written.georef == "gcps":
+        return "Next: OUT has control points and no grid; gdalwarp makes one of them."
+    if written.warp:
+        return "Next: the resampled grid is north-up, ready for pansharpening with PAN."
     original, corrected = alignment.correction.original, alignment.correction.corrected
     if corrected.b or corrected.d:
         remedy = "for them add --warp"
@@ -275,15 +288,11 @@ def next_line(alignment: Alignment) -> str:
 
 def _refused_lines(alignment: Alignment) -> list[str]:
     failed = [reason.message for reason in alignment.verdict.reasons if not reason.passed]
-    tips = (
-        "Next: see that both rasters show the same ground; widen --search-radius when the header "
-        "is further off; try --band with the band that looks most like PAN; mask clouds (--mask)."
-    )
     return [
         "Refused: the images do not support an alignment; the header stays as it is.",
         *(f"  - {message}" for message in failed),
         masks_line(alignment),
-        tips,
+        f"Next: {alignment.verdict.remedy}",
     ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geodelreg.judge.words import region, remedy_of
+from geodelreg.judge.words import region
 from geodelreg.options import AlignOptions, flags
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import found_line, next_line, short, with_metres
@@ -187,7 +187,7 @@ def story(alignment: Alignment, check: Check | None = None) -> list[str]:
 def advice(alignment: Alignment, check: Check | None = None) -> str:
     """What to do next."""
     if alignment.verdict.outcome is Outcome.REFUSED:
-        return remedy_of(alignment.verdict)
+        return alignment.verdict.remedy
     if check is None:
         return _sentence(next_line(alignment).removeprefix("Next: "))
     if check.outcome is CheckOutcome.MISALIGNED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -141,6 +142,33 @@ def test_a_few_patches_of_many_that_agree_are_chance(tmp_path: Path) -> None:
     scene = make_scene(SPEC, sample_imagery())
     edges = written(tmp_path, BentPair(replace(scene, ms=gradient_contrast(scene.ms))))
     assert refusal(edges)[1].verdict.reasons
+
+
+@pytest.mark.parametrize("shift", [(-6.0, -2.4), (-1.6, -0.9)])
+def test_bands_that_lie_apart_are_refused_and_named_however_far(
+    shift: tuple[float, float], tmp_path: Path
+) -> None:
+    apart = bands_apart(tmp_path, shift)
+    error, alignment = refusal(apart)
+    assert "bands" in failed(alignment)
+    told = re.search(r"Band 3 lies ([\d.]+) px right and ([\d.]+) px down of Band", str(error))
+    assert told is not None
+    assert [float(number) for number in told.groups()] == pytest.approx(np.negative(shift), abs=0.2)
+    assert "--band" in error.remedy
+    alone = geodelreg.align(apart.ms, apart.pan, AlignOptions(band=1))
+    assert np.abs(apart.pair.errors(alone.correction.corrected)).max() < 0.1
+
+
+def test_bands_that_lie_a_little_apart_are_warned_of(tmp_path: Path) -> None:
+    apart = bands_apart(tmp_path, (0.6, -0.5))
+    alignment = geodelreg.align(apart.ms, apart.pan)
+    assert any("MS bands do not agree: Band 3" in warning for warning in alignment.warnings)
+
+
+def bands_apart(folder: Path, shift: tuple[float, float]) -> Made:
+    still = (0.0, 0.0)
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=(still, still, shift, still))
+    return written(folder, BentPair(scene))
 
 
 def test_where_one_affine_is_the_truth_hardly_anything_is_left(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+import geodelreg
+from geodelreg.errors import AlignmentRefusedError
 from geodelreg.fit.chance import log10_binomial_tail
 from geodelreg.judge.verdict import Evidence, is_worthwhile, judge, nothing_agrees, verdict
 from geodelreg.options import AlignOptions
 from geodelreg.values.result import Outcome
+from tests.unit.alignment_sample import refused
 
 GOOD = Evidence(
     points=100,
@@ -33,6 +37,7 @@ GOOD = Evidence(
     keypoints_apart=0.0,
     residual_low_px=0.0,
     moved=0.0,
+    bands=0.3,
 )
 # as docs/method.md tells them
 UPPER = {
@@ -46,6 +51,7 @@ UPPER = {
     "keypoints_apart": 2.0,
     "residual_low_px": 0.5,
     "moved": 0.05,
+    "bands": 1.0,
 }
 LOWER = {"points": 8, "coverage": 0.05, "support": 0.5}
 ASKED = {
@@ -145,3 +151,38 @@ def test_small_insignificant_corrections_are_not_worthwhile(
     move, sigma = np.zeros(25), np.full(25, sigma_px)
     move[-1] = move_px
     assert is_worthwhile(move, sigma, tolerance_px=0.02) is moves
+
+
+def test_of_a_refused_alignment_nothing_is_written(tmp_path: Path) -> None:
+    out, points = tmp_path / "out.tif", tmp_path / "out.points"
+    with pytest.raises(AlignmentRefusedError):
+        geodelreg.write(refused(), out)
+    with pytest.raises(AlignmentRefusedError):
+        geodelreg.write_in_place(refused())
+    with pytest.raises(AlignmentRefusedError) as caught:
+        geodelreg.export_gcps(refused(), points)
+    assert "--search-radius" in caught.value.remedy
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("names", "word"),
+    [
+        ({"moved": 0.3}, "--mask"),
+        ({"moved": 0.3, "residual_low_px": 2.0}, "--mask"),
+        ({"residual_low_px": 2.0}, "--on-local"),
+        ({"bands": 3.0}, "--band N"),
+        ({"rival": 0.99}, "repeated texture"),
+        ({"sigma_px": 2.0}, "simpler --model"),
+        ({"support": 0.1}, "same ground"),
+    ],
+)
+def test_a_refusal_says_what_can_be_done_here(names: dict[str, float], word: str) -> None:
+    evidence = replace(GOOD, **names)  # type: ignore[arg-type]
+    assert word in verdict(judge(evidence, AlignOptions()), moves=True).remedy
+
+
+def test_a_correction_beyond_what_was_allowed_names_the_limits() -> None:
+    far = replace(GOOD, shift_px=40.0)
+    found = verdict(judge(far, AlignOptions(max_shift_px=9.0)), moves=True)
+    assert "--max-shift" in found.remedy

@@ -16,7 +16,7 @@ from pyproj import CRS
 from scipy import ndimage
 
 from geodelreg.coarse.scopes import scopes
-from geodelreg.fine.layers import Claim, bands_apart, bright_mask, keypoints_apart, rival_motion
+from geodelreg.fine.layers import Claim, bright_mask, keypoints_apart, rival_motion
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.matching import match_bands, match_pass
 from geodelreg.fine.overlay import Overlay, widened
@@ -25,6 +25,7 @@ from geodelreg.fine.tone import single_band
 from geodelreg.fine.tuning import Tuning
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap
+from geodelreg.judge.bands import bands_apart
 from geodelreg.judge.in_place import AreaEvidence, area_evidence, best_in_place
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.options import AlignOptions
@@ -205,8 +206,8 @@ def two_bands(parallax_px: float) -> float:
     tiles = read_tiles(part, [Window(0, 0, 200, 200)], IDENTITY)
     with ThreadPoolExecutor(2) as pool:
         tuning = Tuning(0.5, single_band(2, 0))
-        passes = match_bands(part, tiles, IDENTITY, tuning, 20, pool)
-    return bands_apart(passes, pair.source_centre)
+        passes = match_bands(part, tiles, tuning, 20, IDENTITY, pool)
+    return bands_apart(passes, pair).distance_px
 
 
 def test_bands_of_clouds_are_apart() -> None:

@@ -217,6 +217,23 @@ def test_the_simplest_true_model_is_chosen(truth: str, extra: float) -> None:
     assert chosen.count(truth) >= 7
 
 
+@pytest.mark.parametrize(("tilt_px", "chosen"), [(0.0, "affine"), (50.0, "scale")])
+def test_rotation_must_pay_and_what_is_neglected_is_told(tilt_px: float, chosen: str) -> None:
+    points = observe("affine", np.random.default_rng(10))
+    selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX, tilt_px)
+    assert selection.estimate.model in (chosen, "shift" if chosen == "scale" else chosen)
+    left = np.hypot(*error(robust_fit("scale", points, FRAME), "affine").T).max()
+    expected = 0.0 if chosen == "affine" else left
+    assert selection.neglected_px == pytest.approx(expected, rel=0.1)
+
+
+def test_what_only_noise_would_rotate_is_not_called_neglected() -> None:
+    points = observe("shift", np.random.default_rng(10))
+    selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX, 50.0)
+    assert selection.estimate.model == "shift"
+    assert selection.neglected_px < 0.02
+
+
 def test_a_model_that_is_asked_for_is_taken() -> None:
     points = observe("affine", np.random.default_rng(10))
     selection = select_model(points, FRAME, CORNERS, "shift", NEGLIGIBLE_PX)

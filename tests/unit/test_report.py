@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator, FormatChecker
 from jsonschema.exceptions import ValidationError
 from pyproj import CRS, Geod
 
-from geodelreg.options import MODELS, AlignOptions
+from geodelreg.options import MODELS, AlignOptions, WriteOptions
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import report_dict, report_json, report_schema, summary_text
 from geodelreg.values.points import Status
@@ -284,9 +284,22 @@ def test_summary_of_a_shift() -> None:
 
 def test_summary_of_a_rotation_names_the_remedies() -> None:
     text = summary_text(alignment(model="affine", corrected=rotated(0.3)))
-    assert "turned +0.3000° counterclockwise" in text
+    assert "turned 0.3000° counterclockwise" in text
     assert "--warp" in text
     assert "--model scale" in text
+
+
+def test_summary_of_a_rotation_to_the_right_has_no_sign() -> None:
+    text = summary_text(alignment(model="affine", corrected=rotated(-0.3)))
+    assert "turned 0.3000° clockwise" in text
+
+
+def test_summary_of_what_was_resampled_or_has_control_points_recommends_neither() -> None:
+    turned = alignment(model="affine", corrected=rotated(0.3))
+    assert "--warp" not in summary_text(turned, WriteOptions(warp=True))
+    last = summary_text(alignment(), WriteOptions(georef="gcps")).splitlines()[-1]
+    assert "control points" in last
+    assert "north-up" not in last
 
 
 def test_summary_of_a_raster_that_was_rotated_before() -> None:
