@@ -163,6 +163,9 @@ def start_run(given: Mapping[str, Any]) -> None:
         When a setting cannot be one.
     """
     configure_logging(given["verbose"], given["quiet"], given["debug"])
+    # BLAS, not loaded yet: its threads spin while they wait, so that on a busy machine the fit of
+    # a field took minutes; matrices of some hundred points gain nothing from them
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for key, value in given["config"]:
         try:
             os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
