@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.values.result import Alignment, CheckOutcome, Input, Misalignment, Solution, Timings
 from geodelreg.writing import AnyPath, paths_of
+
+logger = logging.getLogger(__name__)
 
 MAX_LIMIT_PX = 1e6
 
@@ -55,6 +58,13 @@ def _open(
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
             inputs = _input(ms, paths_of(source)), _input(pan, (str(reference),))
+        for role, reader in (("MS", ms), ("PAN", pan)):
+            height, width = reader.grid.shape
+            logger.info(
+                "%s: %s, %d × %d pixels, bands %s, geotransform %s",
+                role, reader.name, width, height, ", ".join(reader.band_names),
+                reader.grid.transform.to_gdal(),
+            )  # fmt: skip
         yield _Rasters(ms, pan, *inputs, timings)
 
 
