@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
@@ -29,6 +30,8 @@ from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, 
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
 from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, Solution, Timings
+
+logger = logging.getLogger(__name__)
 
 _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
 _TILT_PX = 0.1
@@ -89,11 +92,19 @@ def align_pair(
     report(_OPENED, "reading")
     for seen, guess in pair.timings.each("search", _guesses(pair)):
         report(_FOUND + looked / 4, "refining")
+        logger.info("guess from %s: %s", guess.images.scope.name, _listed(guess.counts))
         if is_degenerate(guess):
             continue  # of headers that squeeze the ground to a line
         found = find(seen, guess)
         if found is not None:
+            model, counts = found.fitted.selection.estimate.model, found.fitted.counts
+            more = {step: counts[step] for step in counts if step not in guess.counts}
+            logger.info("refined: %s, model %s", _listed(more), model)
+            report(_FOUND + (1 + 3 * looked) / 16, "judging")
             solution = conclude(seen, found, heard)
+            for reason in solution.verdict.reasons:
+                if not reason.passed:
+                    logger.info("not believed: %s", reason.message)
             if solution.verdict.accepted:
                 report(1.0, "done")
                 return seen, solution
@@ -103,6 +114,10 @@ def align_pair(
         looked = (1.0 + looked) / 2
     report(1.0, "refused")
     return pair, max(refused, key=_passed) if refused else _nothing_found(pair)
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {step}" for step, count in counts.items())
 
 
 def _guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:

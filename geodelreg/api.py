@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -27,6 +28,8 @@ from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution, Timings
+
+logger = logging.getLogger(__name__)
 
 MAX_LIMIT_PX = 1e6
 
@@ -60,6 +63,13 @@ def _open(
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
+        for role, reader in (("MS", ms), ("PAN", pan)):
+            height, width = reader.grid.shape
+            logger.info(
+                "%s: %s, %d × %d pixels, bands %s, geotransform %s",
+                role, reader.name, width, height, ", ".join(reader.band_names),
+                reader.grid.transform.to_gdal(),
+            )  # fmt: skip
         yield _Rasters(ms, pan, _input(ms), _input(pan), timings)
 
 

@@ -14,6 +14,8 @@ def shown(text: str) -> str:
 
     Names of files, and of bands inside them, come from strangers.
     """
+    if text.isprintable():
+        return text
     escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return "".join(escaped)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from geodelreg.errors import AlignmentRefusedError, UsageError
+from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
 from geodelreg_cli.console import log_steps, progress_bar
@@ -283,6 +283,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
             with together(inputs=lambda: inputs):
                 _draw(refusal.alignment, request)
                 _write_texts(_reports(refusal.alignment, request), request)
+            _log_timings(refusal.alignment)
             if not request.quiet:
                 click.echo(_step_counts(refusal.alignment), err=True)
         raise
@@ -291,9 +292,37 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
         _draw(alignment, request)
         _write(alignment, request)
         _write_texts(reports, request)
+    _log_timings(alignment)
     if not request.quiet:
+        click.echo(shown(_named(request)), err=True)
         click.echo(summary_text(alignment, request.write_options), err=True)
         click.echo(_step_counts(alignment), err=True)
+        click.echo(shown(_written(request)), err=True)
+
+
+def _named(request: Request) -> str:
+    """The inputs, in one line."""
+    more = f" and {len(request.sources) - 1} more" if len(request.sources) > 1 else ""
+    return f"MS {request.sources[0]}{more}, PAN {request.reference}"
+
+
+def _written(request: Request) -> str:
+    """The outputs, in one line."""
+    paths = [request.output, *request.gcps, *request.reports, request.figure]
+    names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
+    if request.in_place:
+        names = f"the header of MS{', ' if names else ''}{names}"
+    return f"Written: {names}" if names else "Written: nothing (dry run)"
+
+
+def _log_timings(alignment: Alignment) -> None:
+    """Where the time went, and what did the work, for -v."""
+    log = logging.getLogger(__name__)
+    timings = (f"{step} {seconds:.2f}" for step, seconds in alignment.timings_s.items())
+    log.info("seconds: %s", ", ".join(timings))
+    log.info("versions: %s", ", ".join(f"{n} {v}" for n, v in alignment.versions.items()))
+    if alignment.crs_operation:
+        log.info("coordinates: %s", alignment.crs_operation)
 
 
 def _step_counts(alignment: Alignment) -> str:

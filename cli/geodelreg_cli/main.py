@@ -28,6 +28,7 @@ COMMANDS = {
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "figure": ("geodelreg_cli.figure", "Draw what a JSON report tells: before and after, arrows."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
+    "info": ("geodelreg_cli.info", "Tell grid, CRS, footprint, bands and provenance of rasters."),
     "pansharpen": ("geodelreg_cli.pansharpen", "Align MS, then sharpen it with PAN."),
     "report": ("geodelreg_cli.report", "Make a page to look at out of a JSON report."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),

@@ -140,7 +140,7 @@ def tidy_up(task: Task) -> None:
 
 def _align(task: Task, result: PairResult) -> PairResult:
     import geodelreg
-    from geodelreg.batch.figures import footprint
+    from geodelreg.geo.lonlat import footprint
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.provenance import provenance_tags, written_tags
     from geodelreg.product.targets import make_folder
@@ -231,7 +231,8 @@ def _write_page(task: Task, alignment: Alignment, check: Check | None = None) ->
 
 def _with_alignment(result: PairResult, alignment: Alignment) -> PairResult:
     """Figures, warnings and the footprint under the header as it is."""
-    from geodelreg.batch.figures import figures_of, footprint
+    from geodelreg.batch.figures import figures_of
+    from geodelreg.geo.lonlat import footprint
 
     return replace(
         result,

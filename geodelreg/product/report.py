@@ -44,6 +44,11 @@ def report_json(alignment: Alignment, tie_points: bool = False) -> str:
 def json_text(report: Mapping[str, Any]) -> str:
     """Text of a report: keys sorted, floats exact, no final newline."""
     text = json.dumps(report, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return escaped(text)
+
+
+def escaped(text: str) -> str:
+    """JSON in which what a terminal would obey is written as escapes."""
     return _UNSHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 

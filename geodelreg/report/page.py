@@ -35,7 +35,6 @@ _TITLES = {
     "middle": "Middle of the common ground",
 }
 _SHAPES = ("cross", "triangle", "diamond", "plus", "ring", "dot")
-_SMALLEST_SCALE_PX = 0.05
 _PLACE_MARKS = "123"
 
 
@@ -205,24 +204,22 @@ def _rejected(alignment: Alignment, canvas: Canvas) -> list[dict[str, Any]]:
 def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
     points, at = alignment.tie_points, cells(frame)
     limit = alignment.options.max_residual_px
-    for title, told, values, least in (
+    for title, told, values in (
         (
             "What is left",
             "Median residual of the points around each place, those that lie elsewhere included",
             error_map(points, frame),
-            limit,
         ),
         (
             "How sure it is",
             "Standard error of the correction",
             sigma_map(frame),
-            _SMALLEST_SCALE_PX,
         ),
     ):
         if not np.isfinite(values).any():
             continue
         worst = np.unravel_index(int(np.nanargmax(values)), values.shape)
-        most = max(float(np.nanpercentile(values, 99)), least)
+        most = max(float(np.nanpercentile(values, 99)), limit)
         yield {
             "title": title,
             "told": f"{told}, PAN pixels. Median {short(float(np.nanmedian(values)))}; most, "

@@ -34,6 +34,8 @@ _PIXEL_SIGMA = 0.45
 """Blur of a pixel and its optics, in pixels."""
 
 _BROAD = 24.0
+_FINEST_SIGMA = 3.0
+"""Pixels of a blur that is not made any finer: the rest is done by averaging before."""
 
 Picture = NDArray[np.uint8]
 """(H, W, 3), red first."""
@@ -243,10 +245,20 @@ def _over(pan: FloatArray, ms: FloatArray) -> Picture:
 
 
 def _blurred(image: FloatArray, known: BoolArray, sigma: float) -> FloatArray:
-    """Mean around each pixel of what is known there."""
-    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), sigma)
-    total = cv2.GaussianBlur(np.where(known, image, 0.0), (0, 0), sigma)
-    return np.asarray(total / np.maximum(weight, 1e-6))
+    """Mean around each pixel of what is known there; broad ones are made of averages of pixels."""
+    height, width = image.shape
+    step = max(1, int(sigma / _FINEST_SIGMA))
+    small = (-(-width // step), -(-height // step))
+    total, weight = (
+        cv2.GaussianBlur(
+            cv2.resize(plane.astype(np.float32), small, interpolation=cv2.INTER_AREA),
+            (0, 0),
+            sigma / step,
+        )
+        for plane in (np.where(known, image, 0.0), known)
+    )
+    mean = total / np.maximum(weight, np.float32(1e-6))
+    return np.asarray(cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _picture(planes: Sequence[Any] | FloatArray) -> Picture:

@@ -14,8 +14,8 @@ from geodelreg.judge.words import region
 from geodelreg.options import AlignOptions, flags
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import found_line, next_line, short, with_metres
-from geodelreg.report.residuals import elsewhere, matched
-from geodelreg.values.points import Status
+from geodelreg.report.residuals import elsewhere, local_residual, matched
+from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
 from geodelreg.values.result import Alignment, CheckOutcome, Outcome, Reason
 
@@ -102,17 +102,15 @@ FAILED = {
     "disagreement_px": "Two halves of the tie points tell different corrections.",
     "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
     "rival_motion": "A second part of the picture moves otherwise, and is nearly as large as the "
-    "part that was followed: a torn mosaic, moving clouds or ice, or steep terrain.",
+    "part that was followed.",
     "support": "Too many areas look alike better elsewhere than in place.",
     "bands_apart": "The bands of MS do not lie on each other, as over clouds.",
     "keypoints_apart": "Distinct features say another place than the patches.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",
     "max_scale": "The scale differs by more than you allowed.",
-    "two_motions": "A part of the picture lies elsewhere than the rest, as if it were torn: a "
-    "faulty mosaic, dropped rows, or moving clouds or ice.",
-    "local": "The ground is bent smoothly against PAN, as by relief or a moving sensor, and no "
-    "header can follow that.",
+    "two_motions": "A part of the picture lies elsewhere than the rest.",
+    "local": "One affine, and so a header, cannot follow all of the ground.",
 }
 """Of each reason of the gate: what it means that it failed."""
 _AT_LEAST = ("tie_points", "coverage", "support")
@@ -204,8 +202,8 @@ def _left(alignment: Alignment) -> str:
     accuracy, parts = alignment.accuracy, []
     if math.isfinite(accuracy.check_rmse_px):
         error = with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)
-        whose = "" if alignment.verdict.accepted else "Of the part that was followed: "
-        parts.append(f"{whose}Tie points that the fit had not seen miss by {error} (RMSE).")
+        whose = "" if alignment.verdict.accepted else " of the part that was followed"
+        parts.append(f"Tie points{whose} that the fit had not seen miss by {error} (RMSE).")
     if math.isfinite(accuracy.sigma_corner_px):
         parts.append(
             f"The correction is known to {short(accuracy.sigma_centre_px)} PAN px at the centre "
@@ -227,15 +225,24 @@ def _elsewhere(alignment: Alignment) -> str:
     if away.sum() < _WORTH_A_WORD * some.sum() or not away.any():
         return ""
     off = points.residual_px[away]
-    middle = np.median(off, axis=0)
-    apart = float(np.median(np.hypot(*(off - middle).T)))
-    together = apart < _TOGETHER * float(np.hypot(*middle))
-    how = f"all alike, {direction(middle)}" if together else "in various directions"
+    length = float(np.median(np.hypot(*off.T)))
     return (
-        f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere, "
-        f"{short(float(np.median(np.hypot(*off.T))))} PAN px off in the median, {how}: "
-        f"{_region(alignment, some, away)} of the picture."
+        f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere: "
+        f"{_region(alignment, some, away)} of the picture, {short(length)} PAN px off in the "
+        f"median, {_pattern(points, away, length)}."
     )
+
+
+def _pattern(points: TiePoints, away: BoolArray, length_px: float) -> str:
+    """How the patches that lie elsewhere move: as one, more and more, or each for itself."""
+    off = points.residual_px[away]
+    middle = np.median(off, axis=0)
+    if np.median(np.hypot(*(off - middle).T)) < _TOGETHER * length_px:
+        return f"all alike ({direction(middle)}), as if that part were torn off and moved"
+    around, _ = local_residual(points, points.reference_px[away])
+    if np.median(np.hypot(*(off - around).T)) < _TOGETHER * length_px:
+        return "in directions that change gradually, as if the picture were bent"
+    return "each in its own direction, as clouds and changed ground do"
 
 
 def _silent(alignment: Alignment) -> str:

@@ -1,0 +1,1 @@
+"""The pages of `geodelreg.report` in a real browser."""
