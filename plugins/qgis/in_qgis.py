@@ -25,6 +25,7 @@ from qgis.core import (
     QgsProcessingModelChildParameterSource,
     QgsProcessingModelOutput,
     QgsProcessingModelParameter,
+    QgsProcessingOutputHtml,
     QgsProcessingParameterRasterLayer,
     QgsProject,
     QgsRasterLayer,
@@ -89,10 +90,14 @@ def align(folder: Path) -> None:
             "OUTPUT": str(folder / "aligned.tif"),
             "TIE_POINTS": "memory:",
             "MESH": "memory:",
+            "PAGE": str(folder / "page.html"),
         },
         feedback=feedback,
     )
     points, mesh = done["TIE_POINTS"], done["MESH"]
+    linked = QgsApplication.processingRegistry().algorithmById("geodelreg:align")
+    assert isinstance(linked.outputDefinition("PAGE"), QgsProcessingOutputHtml)
+    assert "<html" in Path(done["PAGE"]).read_text(encoding="utf-8")
     assert done["OUTCOME"] == "aligned"
     assert points.crs() == QgsRasterLayer(done["OUTPUT"]).crs()
     assert points.featureCount() > 50
@@ -236,6 +241,7 @@ def batch_algorithm(folder: Path) -> None:
             "OUT_ROOT": str(folder / "batch"),
             "TABLE": str(folder / "table.csv"),
             "FOOTPRINTS": "memory:",
+            "PAGES": str(folder / "pages"),
         },
         feedback=feedback,
     )
@@ -244,6 +250,7 @@ def batch_algorithm(folder: Path) -> None:
     assert len(list((folder / "batch" / "out").glob("*.tif"))) == len(PAIRS)
     assert feedback.steps[-1] == 100
     assert len(feedback.warnings) == 1
+    assert Path(done["INDEX"]).exists()
     say(f"batch: {done['OUTCOME']}, footprints as a layer")
 
 
@@ -277,6 +284,31 @@ def cancel(folder: Path) -> None:
     say(
         f"cancelled at {2 * len(CANCELLED_AFTER_S)} moments: over within {slowest:.2f} s, no debris"
     )
+
+
+def cancel_batch(folder: Path) -> None:
+    """Cancel a batch when its first pair is done, and let it go on."""
+    import processing
+
+    (folder / "again").mkdir()
+    target = {
+        "PAIR_MS": str(folder / "ms {n}.tif"),
+        "PAIR_PAN": str(folder / "pan {n}.tif"),
+        "OUTPUT": "{n}.tif",
+        "OUT_ROOT": str(folder / "again"),
+        "WORKERS": 1,
+        "TABLE": str(folder / "again.csv"),
+    }
+    feedback = Listening()
+    feedback.progressChanged.connect(lambda percent: feedback.cancel())
+    message = refusal(lambda: processing.run("geodelreg:batch", target, feedback=feedback))
+    assert "The pairs that are done stay" in message, message
+    done = len(list((folder / "again").glob("*.tif")))
+    assert 1 <= done < len(PAIRS)
+    assert not [path for path in (folder / "again").iterdir() if path.name.startswith(".")]
+    processing.run("geodelreg:batch", {**target, "RESUME": True})
+    assert len(list((folder / "again").glob("*.tif"))) == len(PAIRS)
+    say(f"a batch cancelled after {done} of {len(PAIRS)} pairs goes on")
 
 
 def refusals(folder: Path) -> None:
@@ -353,9 +385,8 @@ def main(folder: Path) -> None:
     assert processing
     plugin = Plugin(None)
     plugin.initProcessing()
-    for step in (
-        align, looked_only, refusals, commands, cancel, model, batch_mode, batch_algorithm
-    ):  # fmt: skip
+    looking, stopping = (align, looked_only, refusals, commands), (cancel, cancel_batch)
+    for step in (*looking, *stopping, model, batch_mode, batch_algorithm):
         step(folder)
     plugin.unload()
     sys.stdout.flush()

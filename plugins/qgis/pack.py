@@ -28,8 +28,8 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 
 # Options that the plugin's own parameters stand for, or that it sets itself.
 SET_BY_THE_PLUGIN = frozenset(
-    {"masks", "pan_masks", "dry_run", "in_place", "overwrite", "gcp_format", "json", "config"}
-) | {"quiet", "verbose", "debug", "pair", "help", "dask"}
+    {"masks", "pan_masks", "dry_run", "in_place", "overwrite", "gcp_format", "json"}
+) | {"quiet", "verbose", "debug", "config", "figure_kind", "pair", "help", "dask"}
 
 
 def describe(name: str) -> dict[str, Any]:

@@ -35,7 +35,8 @@ from geodelreg_qgis.base import MS, PAN, GeodelregAlgorithm, fill, helped
 from geodelreg_qgis.loading import ResultGroup
 from geodelreg_qgis.tie_points import TiePoint, read_tie_points
 
-OUTPUT, TIE_POINTS, MESH, GCPS, REPORT = "OUTPUT", "TIE_POINTS", "MESH", "GCPS", "REPORT"
+OUTPUT, TIE_POINTS, MESH = "OUTPUT", "TIE_POINTS", "MESH"
+GCPS, REPORT, PAGE = "GCPS", "REPORT", "PAGE"
 OUTCOME, CHECK_RMSE_PX = "OUTCOME", "CHECK_RMSE_PX"
 
 _GCP_FILES = (
@@ -72,6 +73,7 @@ class _Aligning(GeodelregAlgorithm):
         )
         for name, label, files in (
             (GCPS, "Control points", _GCP_FILES),
+            (PAGE, "Page to look at: before, after, arrows", "HTML (*.html)"),
             (REPORT, "Report", "JSON (*.json)"),
         ):
             self.addParameter(
@@ -91,12 +93,14 @@ class _Aligning(GeodelregAlgorithm):
     ) -> dict[str, Any]:
         """Run the command, and make layers of the tie points."""
         given = {
-            name: self.parameterAsFileOutput(parameters, name, context) for name in (GCPS, REPORT)
+            name: self.parameterAsFileOutput(parameters, name, context)
+            for name in (GCPS, REPORT, PAGE)
         }
         with tempfile.TemporaryDirectory(prefix="geodelreg-") as folder:
             points = Path(folder, "tie.points")
             report = Path(given[REPORT] or Path(folder, "report.json"))
             words = [*self.rasters, *where, "--overwrite", "--report", str(report)]
+            words += ["--report", given[PAGE]] if given[PAGE] else []
             for file in (str(points), given[GCPS]):
                 words += ["--gcps", file] if file else []
             self.call([*words, *self.option_words(parameters, context)], feedback)
@@ -121,7 +125,7 @@ class _Aligning(GeodelregAlgorithm):
         points = name == TIE_POINTS
         fields = QgsFields()
         for field in TiePoint.__dataclass_fields__ if points else ():
-            fields.append(QgsField(field, QVariant.Type.Double))
+            fields.append(QgsField(field, QVariant.Double))
         kind = QgsWkbTypes.Type.Point if points else QgsWkbTypes.Type.Polygon
         sink, layer = self.parameterAsSink(parameters, name, context, fields, kind, self.ms_crs)
         if sink is None:

@@ -106,6 +106,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
     TITLE: ClassVar[str]
     ABOUT: ClassVar[str]
     """Help beside the dialog."""
+    CANCELLED: ClassVar[str] = "Cancelled; nothing was written."
 
     # --- what QGIS asks ---------------------------------------------------------------------------
 
@@ -341,7 +342,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
         except CommandError as error:
             raise QgsProcessingException(str(error)) from error
         if finished.code is None:
-            raise QgsProcessingException("Cancelled; nothing was written.")
+            raise QgsProcessingException(self.CANCELLED)
         if finished.code not in answers:
             raise QgsProcessingException(reason(finished.messages))
         return finished

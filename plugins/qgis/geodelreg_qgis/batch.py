@@ -17,10 +17,12 @@ from qgis.core import (
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
+    QgsProcessingOutputHtml,
     QgsProcessingOutputString,
     QgsProcessingParameterFeatureSink,
     QgsProcessingParameterFile,
     QgsProcessingParameterFileDestination,
+    QgsProcessingParameterFolderDestination,
     QgsProcessingParameterString,
     QgsVectorLayer,
 )
@@ -32,6 +34,7 @@ from geodelreg_qgis.messages import reason
 
 MANIFEST, PAIR_MS, PAIR_PAN, OUT_ROOT = "MANIFEST", "PAIR_MS", "PAIR_PAN", "OUT_ROOT"
 LEDGER, TABLE, FOOTPRINTS, OUTCOME = "LEDGER", "TABLE", "FOOTPRINTS", "OUTCOME"
+PAGES, INDEX = "PAGES", "INDEX"
 
 _ANSWERS = (0, 1, 3, 4)
 """Exit codes: also when some pairs have failed, were refused or are misaligned."""
@@ -45,7 +48,11 @@ class Batch(GeodelregAlgorithm):
     ABOUT = (
         "Aligns, or checks, many pairs in parallel.\n\n"
         "Name a manifest, or patterns of the files of MS and PAN. The ledger keeps what became of "
-        "each pair, so that a batch can go on where it was cancelled (“Resume”)."
+        "each pair, so that a batch can go on where it was cancelled."
+    )
+
+    CANCELLED = (
+        "Cancelled. The pairs that are done stay; “Go on with an existing ledger” does the rest."
     )
 
     def initAlgorithm(self, configuration: dict[str, Any] | None = None) -> None:
@@ -95,6 +102,12 @@ class Batch(GeodelregAlgorithm):
         self.addParameter(
             QgsProcessingParameterFeatureSink(FOOTPRINTS, "Footprints", polygon, optional=True)
         )
+        self.addParameter(
+            QgsProcessingParameterFolderDestination(
+                PAGES, "Pages to look at", optional=True, createByDefault=False
+            )
+        )
+        self.addOutput(QgsProcessingOutputHtml(INDEX, "Pages to look at"))
         self.addOutput(QgsProcessingOutputString(OUTCOME, "Number of pairs by outcome (JSON)"))
 
     def processAlgorithm(
@@ -113,9 +126,11 @@ class Batch(GeodelregAlgorithm):
         words += [manifest] if manifest else []
         words += ["--pair", *pair] if any(pair) else []
         table = Path(self.parameterAsFileOutput(parameters, TABLE, context))
+        pages = self.parameterAsString(parameters, PAGES, context)
         with tempfile.TemporaryDirectory(prefix="geodelreg-") as folder:
             footprints = Path(folder, "footprints.geojson")
             made = ["--overwrite", "--table", str(table), "--footprints", str(footprints)]
+            made += ["--report-dir", pages] if pages else []
             plan = self.call([*words, "--overwrite", "--dry-run"], feedback)
             pairs = len(plan.output.splitlines())
             finished = self.call([*words, *made], feedback, _ANSWERS, pairs)
@@ -126,17 +141,18 @@ class Batch(GeodelregAlgorithm):
             counts = Counter(row["outcome"] for row in csv.DictReader(file))
         if counts["failed"] or counts["refused"] or counts["cannot_tell"]:
             feedback.pushWarning(f"Not all pairs could be aligned; see {table}.")
-        return {TABLE: str(table), FOOTPRINTS: layer, OUTCOME: json.dumps(counts)}
+        index = {PAGES: pages, INDEX: str(Path(pages, "index.html"))} if pages else {}
+        return {TABLE: str(table), FOOTPRINTS: layer, OUTCOME: json.dumps(counts), **index}
 
     def _footprints(
         self, file: Path, parameters: dict[str, Any], context: QgsProcessingContext
     ) -> str | None:
         """Copy the footprints to where the user wants them; their name for QGIS."""
         found = QgsVectorLayer(str(file), "footprints", "ogr")
-        numbers = (QVariant.Type.Int, QVariant.Type.LongLong, QVariant.Type.Double)
+        numbers = (QVariant.Int, QVariant.LongLong, QVariant.Double)
         fields = QgsFields()  # lists become text, which every format can hold
         for field in found.fields():
-            kind = field.type() if field.type() in numbers else QVariant.Type.String
+            kind = field.type() if field.type() in numbers else QVariant.String
             fields.append(QgsField(field.name(), kind))
         sink, layer = self.parameterAsSink(
             parameters, FOOTPRINTS, context, fields, found.wkbType(), found.crs()

@@ -101,7 +101,7 @@ def make_environment(
         Folder for the environment, which gets a new name each time: one that is in use stays.
     python : str
     package : Path
-        Wheel or source folder of geodelreg.
+        Wheel or source folder of geodelreg; its ``report`` extra draws the page.
     needed : str
         Version that the plugin needs.
     hear, cancelled : callable
@@ -131,7 +131,7 @@ def make_environment(
     try:
         for words in (
             (python, "-m", "venv", str(folder)),
-            (str(scripts / "python"), *pip, str(package)),
+            (str(scripts / "python"), *pip, f"{package}[report]"),
         ):
             finished = run(words, hear, cancelled)
             if finished.code is None:

@@ -107,7 +107,12 @@ class ResultGroup:
             parent = self._group
             if isinstance(node.layer(), QgsRasterLayer):
                 parent = self._before_and_after(project, node.layer())
-            parent.insertChildNode(0, node.clone())
+            moved = node.clone()
+            moved.setExpanded(False)
+            parent.insertChildNode(0, moved)
+            for group in (self._group, parent):
+                group.setExpanded(False)  # the panel opens on a change, and had nothing to open
+                group.setExpanded(True)
             node.parent().removeChildNode(node)
             if self._flip is not None:
                 self._flip.setIsMutuallyExclusive(True, 0)

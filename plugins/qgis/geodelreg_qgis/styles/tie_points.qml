@@ -20,9 +20,9 @@
                 <Option type="QString" value="MM" name="dash_pattern_offset_unit"/>
                 <Option type="QString" value="0" name="draw_inside_polygon"/>
                 <Option type="QString" value="bevel" name="joinstyle"/>
-                <Option type="QString" value="90,90,90,200" name="line_color"/>
+                <Option type="QString" value="255,212,59,255" name="line_color"/>
                 <Option type="QString" value="dash" name="line_style"/>
-                <Option type="QString" value="0.3" name="line_width"/>
+                <Option type="QString" value="0.5" name="line_width"/>
                 <Option type="QString" value="MM" name="line_width_unit"/>
                 <Option type="QString" value="0" name="offset"/>
                 <Option type="QString" value="MM" name="offset_unit"/>
