@@ -40,9 +40,12 @@ class ProvenGuess(Guess):
     ----------
     proof : Pass
         Over the decimated images; its estimate is not None, and is the guess's map.
+    tuning : Tuning
+        Of that pass.
     """
 
     proof: Pass
+    tuning: Tuning
 
 
 def edge_guess(pair: Pair, images: Overview) -> Guess:
@@ -67,9 +70,8 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     part = roles(pair)
     tile = overview_tile(part, images)
     near = guess.map
+    tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], near, COARSE_SIGMA, _TONE_SAMPLES))
     for options in (MatchOptions(tolerance=ROUGH_STEP), MatchOptions()):
-        tone = fit_tone(part, [tile], near, COARSE_SIGMA, _TONE_SAMPLES)
-        tuning = Tuning(COARSE_SIGMA, tone)
         found = match_pass(part, [tile], near, tuning, options)
         if found.estimate is None:
             return None
@@ -78,7 +80,7 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     logger.debug("at the header: rival %.2f, %d agree, log NFA %.1f", rival, found.kept, surprise)
     if not found.is_calm or surprise > SURE_LOG_NFA:
         return None
-    return ProvenGuess(near, math.nan, {}, images, proof=found)
+    return ProvenGuess(near, math.nan, {}, images, proof=found, tuning=tuning)
 
 
 def _log_nfa(part: Roles, tile: Tile, found: Pass) -> float:

@@ -82,7 +82,7 @@ class Refinement:
         return self.tuning.sigma > _BLURRED_SIGMA and self.part.step < largest_step(self.part)
 
 
-def refine_proven(part: Roles, images: Overview, proof: Pass) -> Refinement | None:
+def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) -> Refinement | None:
     """Passes from where patches of the decimated images agree already.
 
     Parameters
@@ -90,6 +90,8 @@ def refine_proven(part: Roles, images: Overview, proof: Pass) -> Refinement | No
     part : Roles
     images : Overview
         Which the proof is over; where they are not decimated, it stands for the first passes.
+    tuning : Tuning
+        Of the proof.
     proof : Pass
 
     Returns
@@ -103,7 +105,6 @@ def refine_proven(part: Roles, images: Overview, proof: Pass) -> Refinement | No
         return None
     (tiles, size), near, last = read, proof.estimate.map, proof
     options, some = MatchOptions(size=size), _some_of(tiles)
-    tuning = Tuning(DEFAULT_SIGMA, fit_tone(part, some, near, DEFAULT_SIGMA, _FEWER_SAMPLES))
     tuning = replace(tuning, sigma=fit_sigma(part, some, proof, tuning, size))
     if _are_coarse(part, overview_tile(part, images)):
         last = match_pass(part, some, near, tuning, options)
