@@ -18,6 +18,7 @@ COMMANDS = {
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
+    "speed": ("benchmarks.peers.speed", "wall time beside a half-size SIFT script, in turn"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
     "batch": ("benchmarks.batch.run", "many pairs: throughput, Dask, kills, a huge manifest"),

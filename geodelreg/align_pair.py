@@ -144,7 +144,7 @@ def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
     """Patches that agree, without those that the mesh finds out, and the map they choose."""
     with pair.timings("refine"):
         if isinstance(guess, ProvenGuess):
-            refined = refine_proven(roles(pair), guess.proof)
+            refined = refine_proven(roles(pair), guess.images, guess.tuning, guess.proof)
         else:
             refined = refine(roles(pair), guess)
     if refined is None:

@@ -62,6 +62,7 @@ OPENCV = (("opencv-python-headless>=5", *RASTERS),)
 
 PEERS: tuple[Peer, ...] = (
     Peer("OpenCV SIFT + RANSAC", "opencv_sift", OPENCV, "import cv2"),
+    Peer("half-size SIFT", "half_size_sift", OPENCV, "import cv2", settings=("default",)),
     Peer("OpenCV ECC", "opencv_ecc", OPENCV, "import cv2"),
     Peer("phase correlation", "phase_correlation", (("scikit-image", *RASTERS),), "import skimage"),
     Peer("SimpleITK affine MI", "simpleitk", (("SimpleITK", *RASTERS),), "import SimpleITK"),

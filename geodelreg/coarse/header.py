@@ -28,6 +28,7 @@ from geodelreg.values.points import Guess, Overview, Status
 logger = logging.getLogger(__name__)
 
 _EDGE_SIGMA_PX = 0.5
+_TONE_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
 _RIVAL = 0.8  # of repeated texture 0.84 to 1, of others 0.1 to 0.8
 
 
@@ -39,9 +40,12 @@ class ProvenGuess(Guess):
     ----------
     proof : Pass
         Over the decimated images; its estimate is not None, and is the guess's map.
+    tuning : Tuning
+        Of that pass.
     """
 
     proof: Pass
+    tuning: Tuning
 
 
 def edge_guess(pair: Pair, images: Overview) -> Guess:
@@ -66,8 +70,8 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     part = roles(pair)
     tile = overview_tile(part, images)
     near = guess.map
+    tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], near, COARSE_SIGMA, _TONE_SAMPLES))
     for options in (MatchOptions(tolerance=ROUGH_STEP), MatchOptions()):
-        tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], near, COARSE_SIGMA))
         found = match_pass(part, [tile], near, tuning, options)
         if found.estimate is None:
             return None
@@ -76,7 +80,7 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     logger.debug("at the header: rival %.2f, %d agree, log NFA %.1f", rival, found.kept, surprise)
     if not found.is_calm or surprise > SURE_LOG_NFA:
         return None
-    return ProvenGuess(near, math.nan, {}, images, proof=found)
+    return ProvenGuess(near, math.nan, {}, images, proof=found, tuning=tuning)
 
 
 def _log_nfa(part: Roles, tile: Tile, found: Pass) -> float:

@@ -25,7 +25,7 @@ from geodelreg.fit.estimate import Estimate
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Guess
+from geodelreg.values.points import Guess, Overview
 
 COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
@@ -33,6 +33,7 @@ _PASSES_FROM_AFAR = 3
 _SOME_TILES = 2
 _MANY_TILES = 5  # unexplained: ablate
 _LAST_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
+_ONLY_TOLERANCE = 0.0015  # of a patch pixel, where no pass of full resolution goes before
 _LAST_ITERATIONS = 5  # unexplained: ablate
 _FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
 _NEAR_HEADER_PX = 4.0
@@ -81,8 +82,17 @@ class Refinement:
         return self.tuning.sigma > _BLURRED_SIGMA and self.part.step < largest_step(self.part)
 
 
-def refine_proven(part: Roles, proof: Pass) -> Refinement | None:
+def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) -> Refinement | None:
     """Passes from where patches of the decimated images agree already.
+
+    Parameters
+    ----------
+    part : Roles
+    images : Overview
+        Which the proof is over; where they are not decimated, it stands for the first passes.
+    tuning : Tuning
+        Of the proof.
+    proof : Pass
 
     Returns
     -------
@@ -93,13 +103,16 @@ def refine_proven(part: Roles, proof: Pass) -> Refinement | None:
     read = _read(part, proof.estimate.map)
     if read is None:
         return None
-    tiles, size = read
-    options = MatchOptions(size=size)
-    found = _approach(part, _some_of(tiles), proof.estimate.map, options, PLAIN, _PASSES, proof)
-    if found is None or not found.last.is_calm or found.is_blurred:
+    (tiles, size), near, last = read, proof.estimate.map, proof
+    options, some = MatchOptions(size=size), _some_of(tiles)
+    tuning = replace(tuning, sigma=fit_sigma(part, some, proof, tuning, size))
+    if _are_coarse(part, overview_tile(part, images)):
+        last = match_pass(part, some, near, tuning, options)
+    found = Refinement(part, some, tuning, last, size)
+    if not last.is_calm or found.is_blurred:
         return None
-    last = _closely(part, tiles, found, options)
-    return last if last is not None and last.last.is_calm else None
+    closely = _closely(part, tiles, found, replace(options, tolerance=_ONLY_TOLERANCE))
+    return closely if closely is not None and closely.last.is_calm else None
 
 
 def refine(part: Roles, guess: Guess) -> Refinement | None:
@@ -128,13 +141,18 @@ def refine(part: Roles, guess: Guess) -> Refinement | None:
 def _coarse_refinement(part: Roles, guess: Guess) -> PixelMap:
     """One pass over the decimated pair, where that is much coarser than the template."""
     tile = overview_tile(part, guess.images)
-    if decimation(tile.template[0], part.template.grid)[0] < _COARSE_FROM:
+    if not _are_coarse(part, tile):
         return guess.map
     if guess.bright is not None:
         tile = dark_tile(part, tile, guess)
     tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], guess.map, COARSE_SIGMA))
     found = match_pass(part, [tile], guess.map, tuning, MatchOptions())
     return guess.map if found.estimate is None else found.estimate.map
+
+
+def _are_coarse(part: Roles, tile: Tile) -> bool:
+    """True when the decimated images show much less than the template."""
+    return decimation(tile.template[0], part.template.grid)[0] >= _COARSE_FROM
 
 
 def _refine(part: Roles, near: PixelMap, guess: Guess) -> Refinement | None:
@@ -239,6 +257,7 @@ def _passes(
     tuning, last = best.tuning, best.last
     if not last.is_calm:
         tuning, last = sharpest(part, best.tiles, (tuning, last), others, options)
+    options = replace(options, tolerance=_LAST_TOLERANCE)
     return _closely(part, tiles, replace(best, tuning=tuning, last=last), options)
 
 
@@ -248,27 +267,18 @@ def _closely(
     """The last pass, over all tiles."""
     near = found.estimate.map
     tuning = replace(found.tuning, tone=fit_tone(part, tiles, near, found.tuning.sigma))
-    closely = replace(options, tolerance=_LAST_TOLERANCE, iterations=_LAST_ITERATIONS)
-    last = match_pass(part, tiles, near, tuning, closely)
+    options = replace(options, iterations=_LAST_ITERATIONS)
+    last = match_pass(part, tiles, near, tuning, options)
     return None if last.estimate is None else Refinement(part, tiles, tuning, last, options.size)
 
 
 def _approach(
-    part: Roles,
-    tiles: list[Tile],
-    near: PixelMap,
-    options: MatchOptions,
-    look: Look,
-    passes: int,
-    found: Pass | None = None,
+    part: Roles, tiles: list[Tile], near: PixelMap, options: MatchOptions, look: Look, passes: int
 ) -> Refinement | None:
-    """Passes towards the map and the point spread, from a start a few pixels off, or from a pass.
-
-    `found` is the first of the passes when it was made elsewhere.
-    """
+    """Passes towards the map and the point spread, from a start a few pixels off."""
     local = look.local_tone and part.ms_is_template
-    sigma = DEFAULT_SIGMA
-    for number in range(0 if found is None else 1, passes):
+    sigma, found = DEFAULT_SIGMA, None
+    for number in range(passes):
         tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness
