@@ -37,6 +37,7 @@ class _Rasters:
     source: Input
     reference: Input
     timings: Timings
+    fill_notes: tuple[str, ...]
 
 
 @contextmanager
@@ -53,8 +54,9 @@ def _open(
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
+            fill = ms.leave_out(options.ms_nodata), pan.leave_out(options.pan_nodata)
             inputs = _input(ms, paths_of(source)), _input(pan, (str(reference),))
-        yield _Rasters(ms, pan, *inputs, timings)
+        yield _Rasters(ms, pan, *inputs, timings, tuple(note for note in fill if note))
 
 
 def _input(reader: RasterReader, paths: tuple[str, ...]) -> Input:
@@ -200,7 +202,8 @@ def _examine(
         raise under_masks(error, ms, pan) from error
     unsure = [unsettled(Path(path)) for path in (*rasters.source.paths, *rasters.reference.paths)]
     notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
-    alignment = _alignment(rasters, pair, solution, notes + mask_warnings(ms, pan))
+    notes = (*rasters.fill_notes, *notes, *mask_warnings(ms, pan))
+    alignment = _alignment(rasters, pair, solution, notes)
     return alignment, measure_misalignment(pair, solution)
 
 

@@ -95,6 +95,12 @@ class AlignOptions:
         (),
         "The same for PAN. One of the two is enough for any place: a tie point needs both images.",
     )
+    ms_nodata: float | None = _knob(
+        None,
+        "Value of MS pixels that show nothing, whatever the file declares. Without it, what the "
+        "file declares; where it declares nothing, 0 or the largest value that fills a corner.",
+    )
+    pan_nodata: float | None = _knob(None, "The same for PAN.")
     search_radius_px: float = _knob(
         512.0,
         "How far off, in PAN pixels, the header may be for the first search; when that finds "

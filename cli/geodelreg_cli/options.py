@@ -29,6 +29,7 @@ FLAGS = {
     "band": ("-b", "--band"),
     "masks": ("--mask",),
     "pan_masks": ("--pan-mask",),
+    "ms_nodata": ("--nodata",),
     "threads": ("-j", "--num-threads"),
     "workers": ("-j", "--workers"),
     "driver": ("--of",),
@@ -235,7 +236,7 @@ def build(options: type[_Options], given: Mapping[str, Any]) -> _Options:
     click.UsageError
         With the flag the user typed in place of the knob's name.
     """
-    names = [f.name for f in fields(options)]  # type: ignore[arg-type]
+    names = [f.name for f in fields(options) if f.name in given]  # type: ignore[arg-type]
     try:
         return options(**{name: given[name] for name in names})
     except UsageError as error:
