@@ -43,6 +43,7 @@ class _Rasters:
     source: Input
     reference: Input
     timings: Timings
+    fill_notes: tuple[str, ...]
 
 
 @contextmanager
@@ -63,6 +64,7 @@ def _open(
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
+            fill = ms.leave_out(options.ms_nodata), pan.leave_out(options.pan_nodata)
         for role, reader in (("MS", ms), ("PAN", pan)):
             height, width = reader.grid.shape
             logger.info(
@@ -70,7 +72,8 @@ def _open(
                 role, reader.name, width, height, ", ".join(reader.band_names),
                 reader.grid.transform.to_gdal(),
             )  # fmt: skip
-        yield _Rasters(ms, pan, _input(ms), _input(pan), timings)
+        notes = tuple(note for note in fill if note)
+        yield _Rasters(ms, pan, _input(ms), _input(pan), timings, notes)
 
 
 def _input(reader: RasterReader) -> Input:
@@ -257,7 +260,8 @@ def _examine(
     files = [one for one in (rasters.source, rasters.reference) if not one.in_memory]
     unsure = [unsettled(Path(path)) for one in files for path in one.paths]
     notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
-    alignment = _alignment(rasters, pair, solution, notes + mask_warnings(ms, pan))
+    notes = (*rasters.fill_notes, *notes, *mask_warnings(ms, pan))
+    alignment = _alignment(rasters, pair, solution, notes)
     return alignment, measure_misalignment(pair, solution)
 
 

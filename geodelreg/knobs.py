@@ -10,10 +10,14 @@ class AlignKnobs(TypedDict, total=False):
 
     method: str
     model: str
+    north_up: bool
     band: int | None
     pan_band: int
     masks: tuple[str, ...]
     pan_masks: tuple[str, ...]
+    search: str
+    ms_nodata: float | None
+    pan_nodata: float | None
     search_radius_px: float
     tolerance_px: float
     ratio: float

@@ -26,6 +26,7 @@ FLAGS = {
     "band": ("-b", "--band"),
     "masks": ("--mask",),
     "pan_masks": ("--pan-mask",),
+    "ms_nodata": ("--nodata",),
     "threads": ("-j", "--num-threads"),
     "workers": ("-j", "--workers"),
     "driver": ("--of",),
@@ -125,6 +126,12 @@ class AlignOptions:
         "keypoints alone.",
         SEARCHES,
     )
+    ms_nodata: float | None = _knob(
+        None,
+        "Value of MS pixels that show nothing, whatever the file declares. Without it, what the "
+        "file declares; where it declares nothing, 0 or the largest value that fills a corner.",
+    )
+    pan_nodata: float | None = _knob(None, "The same for PAN.")
     search_radius_px: float = _knob(
         512.0,
         "How far off, in PAN pixels, the header may be for the first search; when that finds "

@@ -218,7 +218,7 @@ def build(options: type[_Options], given: Mapping[str, Any]) -> _Options:
     click.UsageError
         With the flag the user typed in place of the knob's name.
     """
-    names = [f.name for f in fields(options)]  # type: ignore[arg-type]
+    names = [f.name for f in fields(options) if f.name in given]  # type: ignore[arg-type]
     try:
         return options(**{name: given[name] for name in names})
     except UsageError as error:

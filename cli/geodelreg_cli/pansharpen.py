@@ -66,7 +66,9 @@ def pansharpen_params() -> list[SectionOption]:
             section=CORRECTION,
             help="Take MS where its header puts it, as after geodelreg align.",
         ),
-        *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
+        *knob_options(
+            AlignOptions, CORRECTION, without=["threads", "allow", "ms_nodata", "pan_nodata"]
+        ),
         *run_options(),
     ]
 

@@ -21,6 +21,7 @@ from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.image.decimate import BoxAverage, Share
 from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
+from geodelreg.image.fill import undeclared_fill
 from geodelreg.image.inputs import Opened
 from geodelreg.image.overviews import Placement, find_placement
 from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
@@ -64,6 +65,8 @@ class RasterFile:
         1-based numbers of the bands that are neither alpha nor quality bands.
     quality_bands : dict of int to str
         Numbers and kinds of the bands that say how good the others are.
+    nodata : float or None
+        What is no data whatever the file declares; None leaves that to the file.
     hides : callable or None
         Takes a `Grid` that is part of this raster's and gives (H, W) bool, True for the pixels
         that are to be invalid whatever the file says.
@@ -83,6 +86,7 @@ class RasterFile:
         if len(self._alpha) == len(every):
             self._alpha = ()
         self.quality_bands = quality_bands(self.path, self.dataset.descriptions)
+        self.nodata: float | None = None
         self.hides: Callable[[Grid], BoolArray] | None = None
         known = {*self._alpha, *self.quality_bands}
         self.image_bands = tuple(number for number in every if number not in known)
@@ -106,6 +110,13 @@ class RasterFile:
         """True ratios of sizes, finest level first."""
         height, width = self.grid.shape
         return tuple(min(width / one.width, height / one.height) for one in self._overviews)
+
+    def undeclared_fill(self) -> float | None:
+        """Value of a corner that is filled, of a file that declares neither no data nor masks."""
+        declares = any(value is not None for value in self.dataset.nodatavals)
+        if declares or self._alpha or self._masked_bands or self.block_note:
+            return None
+        return undeclared_fill(self.dataset, self.image_bands)
 
     @property
     def block_note(self) -> str:
@@ -237,6 +248,8 @@ class RasterFile:
                 "The file is truncated or damaged: copy or download it again.",
             ) from error
         nodata = [level.nodatavals[number - 1] for number in numbers]
+        if self.nodata is not None:
+            nodata = [self.nodata] * len(numbers)
         differing = [differs_from_nodata(raw[plane], value) for plane, value in enumerate(nodata)]
         if all(one is not None and not one.any() for one in differing):
             # most of a sparse raster: as fast as GDAL finds that nothing is there

@@ -143,6 +143,29 @@ class RasterReader:
         """Says so when one block is too large for a file to be read in pieces; else empty."""
         return "; ".join(file.block_note for file in self._files if file.block_note)
 
+    def leave_out(self, nodata: float | None) -> str:
+        """Take a value for no data, or fill that the files do not declare.
+
+        Parameters
+        ----------
+        nodata : float or None
+            None looks for constant areas of 0, or of the type's largest value, at the corners.
+
+        Returns
+        -------
+        str
+            What was found and is left out; empty when nothing was, or when it was told.
+        """
+        notes = []
+        for file in self._files:
+            file.nodata = file.undeclared_fill() if nodata is None else nodata
+            if nodata is None and file.nodata is not None:
+                notes.append(
+                    f"{Path(file.path).name} is filled with {file.nodata:g} up to a corner and "
+                    "does not declare it: left out (a no-data value that is told is taken instead)"
+                )
+        return "; ".join(notes)
+
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
     ) -> list[Band]:
