@@ -25,7 +25,7 @@ from geodelreg.fit.estimate import Estimate
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Guess
+from geodelreg.values.points import Guess, Status
 
 COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
@@ -225,7 +225,8 @@ def _approach(
         tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness
-            sigma = fit_sigma(part, tiles, found, tuning, options.size)
+            agreed = found.matched.template_px[found.status == Status.KEPT]
+            sigma = fit_sigma(part, tiles, near, agreed, tuning, options.size)
             tuning = replace(tuning, sigma=sigma)
         found = match_pass(part, tiles, near, tuning, options)
         if found.estimate is None:

@@ -135,6 +135,7 @@ def remedy_of(verdict: Verdict) -> str:
     failed = {reason.name for reason in verdict.reasons if not reason.passed}
     if failed == {"local"}:
         return (
+            "--warp writes a field that follows the bend; "
             "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
             "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
             "part by part."

@@ -237,7 +237,10 @@ def _next_line(alignment: Alignment) -> str:
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
     if not alignment.fits_a_header:
-        return "Next: no geotransform holds this correction: pass control points on (--gcps)."
+        return (
+            "Next: no geotransform holds this correction: resample with it (--warp), or pass "
+            "control points on (--gcps)."
+        )
     original, corrected = alignment.correction.original, alignment.correction.corrected
     if corrected.b or corrected.d:
         remedy = "for them add --warp"

@@ -269,7 +269,8 @@ class Alignment:
     @property
     def fits_a_header(self) -> bool:
         """False of a correction that no geotransform can hold."""
-        return self.solution.map.as_affine() is not None
+        moves = self.verdict.outcome is Outcome.ALIGNED
+        return not moves or self.solution.map.as_affine() is not None
 
     @property
     def correction(self) -> Correction:
