@@ -14,6 +14,7 @@ COMMANDS = {
         "benchmarks.paper.run",
         "the paper's experiments: SIFT, its method, ours, by ablation",
     ),
+    "field": ("benchmarks.accuracy.field", "pairs that bend and jump, against the known truth"),
     "bound": ("benchmarks.accuracy.bound", "errors against the Cramér–Rao bound"),
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
@@ -18,11 +19,21 @@ from geodelreg.errors import NoOverlapError
 from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.matching import patches_log_nfa, tie_points
 from geodelreg.fine.passes import Refinement, refine, refine_proven
-from geodelreg.fit.choice import Fitted, half_disagreement, select_model
+from geodelreg.fine.settle import settle
+from geodelreg.fit.choice import Fitted, HeldOut, Selection, half_disagreement, select_model
+from geodelreg.fit.estimate import Estimate
+from geodelreg.fit.field import halves_apart, held_out_errors
 from geodelreg.fit.models import PARAMETER_COUNT, Frame
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
-from geodelreg.judge.verdict import is_worthwhile, judge, nothing_agrees, passes, verdict
+from geodelreg.judge.verdict import (
+    is_worthwhile,
+    judge,
+    nothing_agrees,
+    passes,
+    too_few_for_a_field,
+    verdict,
+)
 from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import bands_warning, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
@@ -37,6 +48,7 @@ _NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
 _TILT_PX = 0.1
 """Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _FEWEST_POINTS = 4
+_BENT_TRIES = 2  # of the guesses that one affine could not make good
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
 
 
@@ -46,6 +58,19 @@ class Found(NamedTuple):
     guess: Guess
     refined: Refinement
     fitted: Fitted
+
+
+class _Refused(NamedTuple):
+    """A guess that one affine could not make good."""
+
+    solution: Solution
+    pair: Pair
+    found: Found
+    heard: Sequence[Claim]
+
+    @property
+    def passed(self) -> int:
+        return sum(reason.passed for reason in self.solution.verdict.reasons)
 
 
 def align_pair(
@@ -86,7 +111,7 @@ def align_pair(
     """
     report = progress or (lambda fraction, step: None)
     pair = make_pair(source, reference, options, timings)
-    refused: list[Solution] = []
+    refused: list[_Refused] = []
     heard: list[Claim] = []
     looked = 0.0
     report(_OPENED, "reading")
@@ -109,11 +134,18 @@ def align_pair(
                 report(1.0, "done")
                 return seen, solution
             if not isinstance(guess, ProvenGuess):  # keypoints will have the last word
-                refused.append(solution)
+                refused.append(_Refused(solution, seen, found, tuple(heard)))
         heard.append(Claim(guess.map, guess.log_nfa))
         looked = (1.0 + looked) / 2
+    refused.sort(key=lambda one: one.passed, reverse=True)
+    if may_bend(options):
+        for one in refused[:_BENT_TRIES]:
+            solution = conclude(one.pair, one.found, one.heard, bent=True)
+            if solution.verdict.accepted:
+                report(1.0, "done")
+                return one.pair, solution
     report(1.0, "refused")
-    return pair, max(refused, key=_passed) if refused else _nothing_found(pair)
+    return pair, refused[0].solution if refused else _nothing_found(pair)
 
 
 def _listed(counts: Mapping[str, int]) -> str:
@@ -167,6 +199,8 @@ def fit_patches(
         return None
     negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
     frame, model = Frame.of(pair), pair.options.model
+    if model == "field":
+        model = "affine"  # to start from
     tilt = math.inf if pair.options.north_up else _TILT_PX / pair.pan_px_per_source_px
     selection = select_model(points, frame, pair.source_lattice(2), model, negligible, tilt)
     estimate = selection.estimate
@@ -189,14 +223,24 @@ def fit_patches(
     )
 
 
-def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
-    """Gather the evidence for a map, judge it, and say all that is known."""
+def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = False) -> Solution:
+    """Gather the evidence for a map, judge it, and say all that is known.
+
+    Parameters
+    ----------
+    pair : Pair
+    found : Found
+    heard : sequence of Claim
+        Of guesses that were refused before.
+    bent : bool
+        One affine was refused: judge a field.
+    """
     guess, refined, fitted = found
     options = pair.options
     notes: tuple[str, ...] = ()
     with pair.timings("evidence"):
         accuracy, evidence = gather(guess, refined, fitted, heard)
-        if passes(judge(evidence, options)):
+        if bent or passes(judge(evidence, options)):
             whole = look_at_whole(guess, refined, fitted.map)
             everyone = hear_everyone(pair, found, whole)
             if everyone is not None:
@@ -204,6 +248,10 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
                 if passes(judge(again[1], options)):
                     fitted, (accuracy, evidence) = everyone, again
                     whole = whole.under(pair, fitted.map)
+            if may_bend(options) and (bent or options.model == "field" or whole.is_bent(options)):
+                refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
+                accuracy, evidence = gather(guess, refined, fitted, heard)
+                whole = whole.followed(pair, fitted)
             accuracy, evidence = whole.added_to(accuracy, evidence)
             notes = whole.warnings(options)
         notes += bands_warning(evidence)
@@ -211,14 +259,16 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim]) -> Solution:
         move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
         sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px
         moves = is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
-    model = fitted.selection.estimate.model
+    model, reasons = fitted.selection.estimate.model, judge(evidence, options)
+    if options.model == "field" and model != "field" and passes(reasons):
+        reasons = (*reasons, too_few_for_a_field(accuracy.kept))
     names = [pair.source.band_names[band - 1] for band in pair.source_bands]
     return Solution(
         model=model,
         map=fitted.map,
         tie_points=fitted.points,
         accuracy=accuracy,
-        verdict=verdict(judge(evidence, options), moves),
+        verdict=verdict(reasons, moves),
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
@@ -235,6 +285,46 @@ def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
     return fit_patches(pair, found.guess, found.refined, status)
 
 
+def may_bend(options: AlignOptions) -> bool:
+    """True when a field was asked for, or may be written where one affine is not enough."""
+    asked = options.model == "field" or (options.model == "auto" and options.on_local == "field")
+    return asked and options.method == "delaunay"
+
+
+def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
+    """The ground's smooth map, matched through itself until it stands still.
+
+    Too few patches leave what was found.
+    """
+    guess, refined, fitted = found
+    with pair.timings("field"):
+        settled = settle(refined, whole.field or fitted.map)
+        if settled is None:
+            return refined, fitted
+        refined, field, size = settled.refined, settled.fit.field, len(settled.fit.field.source)
+        tied = tie_points(refined.part, settled.matched, field, settled.status)
+        distance2 = settled.fit.distance2[settled.fit.inlier]
+        none, all_of_them = np.empty(0), np.ones(size, dtype=np.bool_)
+        estimate = Estimate(
+            "field", field, none, none, Frame.of(pair), field.kernel.nugget_px2, all_of_them,
+            distance2,
+        )  # fmt: skip
+        check = HeldOut(held_out_errors(field), distance2)
+        apart_px = pair.pan_px_per_source_px * halves_apart(field)
+        # a field follows its points: those that it has not seen say what chance would do
+        unseen = tied.residual_px.copy()
+        unseen[tied.kept] = pair.pan_px_per_source_px * check.residual_px
+        log_nfa = patches_log_nfa(
+            refined.part, replace(tied, residual_px=unseen), PARAMETER_COUNT["affine"] // 2
+        )
+    counts = guess.counts | {
+        "patches": len(tied),
+        "patches matched": int((settled.matched.status == Status.KEPT).sum()),
+        "patches kept": int(tied.kept.sum()),
+    }
+    return refined, Fitted(Selection(estimate, check), tied, counts, log_nfa, apart_px)
+
+
 def _load_scipy() -> None:
     """Load what a look at the whole raster will need, half hidden behind the evidence."""
     for name in ("scipy.spatial", "scipy.optimize", "scipy.special", "scipy.sparse.csgraph"):
@@ -245,10 +335,6 @@ def is_degenerate(guess: Guess) -> bool:
     """True when a guess squeezes the ground to a line."""
     affine = guess.map.as_affine()
     return affine is not None and affine.is_degenerate
-
-
-def _passed(solution: Solution) -> int:
-    return sum(reason.passed for reason in solution.verdict.reasons)
 
 
 def _nothing_found(pair: Pair) -> Solution:

@@ -118,7 +118,7 @@ class Alignment(result.Alignment):
         TypeError
             It is nothing of xarray's.
         """
-        check_header_holds(self.options.model)
+        check_header_holds(self.solution.model)
         if not is_xarray(raster):
             raise TypeError(
                 f"apply takes a DataArray or Dataset of xarray, not {type(raster).__name__}; of "

@@ -13,8 +13,8 @@ from geodelreg.errors import UsageError
 from geodelreg.masking import parse_mask
 
 METHODS = ("delaunay", "zhang2013", "sift")
-MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective")
-BEYOND_A_HEADER = ("projective",)
+MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective", "field")
+BEYOND_A_HEADER = ("projective", "field")
 """Models that no geotransform can hold."""
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
@@ -94,7 +94,7 @@ class AlignOptions:
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
         "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
-        "projective one: control points do.",
+        "projective one or a field, which follows what bends: --warp does.",
         MODELS,
     )
     north_up: bool = _knob(
@@ -165,9 +165,10 @@ class AlignOptions:
     )
     on_local: str = _knob(
         "refuse",
-        "What to do where one affine leaves more than --max-residual: refuse, or write the best "
-        "affine of the whole overlap all the same and warn.",
-        ("refuse", "warn"),
+        "What to do where one affine leaves more than --max-residual: refuse; warn, and write the "
+        "best affine of the whole overlap all the same; or follow the bend with a field, as auto "
+        "does where --warp can carry it.",
+        ("refuse", "warn", "field"),
     )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
     allow: str = _knob(
@@ -204,6 +205,10 @@ class AlignOptions:
                 "Use auto, shift or scale.",
             )
         _check_range(self, "threads", 0, 1024)
+        if self.model == "field" and self.method != "delaunay":
+            raise UsageError(
+                f"method = {self.method} knows no field", "Use --method delaunay or another model."
+            )
 
 
 def check_header_holds(model: str) -> None:
@@ -216,8 +221,8 @@ def check_header_holds(model: str) -> None:
     if model in BEYOND_A_HEADER:
         raise UsageError(
             f"model = {model} is no affine: no geotransform, and so no header, can hold it",
-            "Pass it on as control points (--gcps FILE with --dry-run, or --georef gcps), or use "
-            "another model.",
+            "Resample (--warp), pass it on as control points (--gcps FILE with --dry-run, or "
+            "--georef gcps), or use another model.",
         )
 
 

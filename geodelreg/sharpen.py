@@ -67,7 +67,7 @@ def pansharpen(
     """
     options = replace(options or PansharpenOptions(), **knobs)
     if alignment is not None:
-        check_header_holds(alignment.options.model)
+        check_header_holds(alignment.solution.model)
     paths = [as_path(path) for path in paths_of(source)]
     masks = () if alignment is None else masks_of(alignment)
     names = [*map(str, paths), str(reference), *masks]

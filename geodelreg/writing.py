@@ -18,6 +18,7 @@ from geodelreg.knobs import WriteKnobs
 from geodelreg.masking import parse_mask
 from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.provenance import provenance_tags
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Alignment, Correction, Outcome
 
@@ -74,8 +75,8 @@ def write(
     _check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
     check_is_file(alignment)
-    if options.georef != "gcps":
-        check_header_holds(alignment.options.model)
+    if not (options.warp or options.georef == "gcps"):
+        _check_header_holds(alignment)
     tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
     notes: list[str] = []
     with (
@@ -88,7 +89,14 @@ def write(
             correction, gcps = correction_of_file(alignment, path)
             if options.warp:
                 notes += write_warped(
-                    path, out, correction, alignment.reference.grid, tags, options, pan
+                    path,
+                    out,
+                    correction,
+                    alignment.reference.grid,
+                    tags,
+                    options,
+                    pan,
+                    placement_of(alignment, correction),
                 )
             else:
                 notes += write_corrected(path, out, correction, gcps, tags, options)
@@ -113,7 +121,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.product.inplace import edit_in_place
 
     _check_accepted(alignment)
-    check_header_holds(alignment.options.model)
+    _check_header_holds(alignment)
     check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
@@ -124,6 +132,31 @@ def write_in_place(alignment: Alignment) -> list[str]:
         for name in alignment.source.paths:
             notes += edit_in_place(Path(name), *correction_of_file(alignment, Path(name)), tags)
     return notes
+
+
+def _check_header_holds(alignment: Alignment) -> None:
+    if not alignment.fits_a_header:
+        check_header_holds(alignment.solution.model)
+
+
+def placement_of(alignment: Alignment, correction: Correction) -> PixelMap | None:
+    """Pixels of an MS file to those of its header, where no geotransform holds the correction.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    correction : Correction
+        Of the file, by `correction_of_file`.
+    """
+    from geodelreg.geo.maps.affine import AffineMap
+
+    if alignment.fits_a_header:
+        return None
+    to_shared = AffineMap(~alignment.source.grid.transform @ correction.original)
+    shared = alignment.solution.map
+    if to_shared.affine.is_identity:
+        return shared
+    return to_shared.then(shared).then(AffineMap(~to_shared.affine))
 
 
 def revert(*paths: AnyPath) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.masking import parse_mask
@@ -183,8 +184,11 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
             "--in-place corrects the header and nothing else: drop --of, --co, --georef, "
             "--strip-rpc and --warp, or write to -o OUT."
         )
-    if not given["dry_run"] and (given["in_place"] or write_options.georef != "gcps"):
-        check_header_holds(given["model"])
+    options = build(AlignOptions, given)
+    if not given["dry_run"] and not _carries_all(write_options):
+        check_header_holds("field" if options.on_local == "field" else options.model)
+    if write_options.warp and _is_default("on_local"):
+        options = replace(options, on_local="field")
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
     return Request(
@@ -200,9 +204,20 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
         figure_kind=given["figure_kind"],
         json=given["json"],
         quiet=given["quiet"],
-        options=build(AlignOptions, given),
+        options=options,
         write_options=write_options,
     )
+
+
+def _carries_all(options: WriteOptions) -> bool:
+    """True of outputs that hold what no geotransform does."""
+    return options.warp or options.georef == "gcps"
+
+
+def _is_default(name: str) -> bool:
+    """True of an option that the user has not given."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source in (None, ParameterSource.DEFAULT)
 
 
 def _check_outputs(request: Request) -> list[Path]:

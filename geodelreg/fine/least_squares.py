@@ -52,12 +52,15 @@ class MatchOptions:
         Patches whose step is below this, in template pixels, take no further one.
     every : int
         Match only every so many-th patch: enough where little is asked of the result.
+    bent : bool
+        Follow a map that bends within patches, instead of its local affine.
     """
 
     size: int = 20
     iterations: int = 4
     tolerance: float = 0.01
     every: int = 1
+    bent: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +118,7 @@ def match_patches(
     """
     count = len(patches)
     local = there.linearise(patches.centre)
+    bend = _curvature(there, patches) if options.bent else None
     offsets = _offsets(patches.size)
     move = np.zeros((count, 2))
     last = np.full(count, np.inf)
@@ -125,7 +129,7 @@ def match_patches(
     for _ in range(options.iterations):
         if not len(active):
             break
-        step = _gauss_newton(patches, surfaces, local, offsets, move, active)
+        step = _gauss_newton(patches, surfaces, local, bend, offsets, move, active)
         move[active] += step.move
         covariance[active], correlation[active] = step.covariance, step.correlation
         share[active] = step.usable_share
@@ -143,6 +147,21 @@ def match_patches(
     return Matched(patches.centre, position, in_surface, correlation, status)
 
 
+def _curvature(there: PixelMap, patches: Patches) -> FloatArray:
+    """(P, 2, 3) second derivatives by patch pixels: along columns, mixed, and along rows.
+
+    By central differences over half a patch.
+    """
+    reach, at = patches.size / 2, patches.centre
+    right = np.array([patches.step[0] * reach, 0.0])
+    down = np.array([0.0, patches.step[1] * reach])
+    ways = [0 * right, right, -right, down, -down]
+    ways += [right + down, -right - down, right - down, down - right]
+    here, e, w, s, n, se, nw, ne, sw = there.forward(np.stack([at + way for way in ways]))
+    second = np.stack([e - 2 * here + w, (se + nw - ne - sw) / 4, s - 2 * here + n], axis=-1)
+    return np.asarray(second / reach**2)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
     move: FloatArray
@@ -155,6 +174,7 @@ def _gauss_newton(
     patches: Patches,
     surfaces: Sequence[Surface],
     local: FloatArray,
+    bend: FloatArray | None,
     offsets: FloatArray,
     move: FloatArray,
     active: np.ndarray[tuple[int], np.dtype[np.intp]],
@@ -163,7 +183,10 @@ def _gauss_newton(
     n, side = patches.size, patches.size + 2 * _MARGIN
     linear = local[active, :, :2] * patches.step
     anchor = local[active, :, 2] + np.einsum("pij,pj->pi", linear, move[active])
-    values, usable = sample_patches(surfaces, patches.owner[active], anchor, linear, offsets)
+    curved = None if bend is None else bend[active]
+    values, usable = sample_patches(
+        surfaces, patches.owner[active], anchor, linear, offsets, curved
+    )
     image = values.reshape(-1, side, side)
     good = usable.reshape(-1, side, side)[:, 1:-1, 1:-1].reshape(len(active), -1)
     good = good & patches.valid[active]

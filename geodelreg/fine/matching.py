@@ -43,6 +43,30 @@ def match_pass(
 
     Parameters
     ----------
+    part, tiles, correction, tuning, options, threads
+        As for `match_tiles`.
+    """
+    matched = match_tiles(part, tiles, correction, tuning, options, threads)
+    points = observe(part, matched, correction)
+    status = matched.status.copy()
+    status[~np.isfinite(points.covariance).all(axis=(1, 2))] = Status.TEXTURE
+    frame = Frame.of(part.pair)
+    unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
+    return Pass(matched, points, *agreement(points, status, correction, frame, unit))
+
+
+def match_tiles(
+    part: Roles,
+    tiles: list[Tile],
+    correction: PixelMap,
+    tuning: Tuning,
+    options: MatchOptions,
+    threads: int = 0,
+) -> Matched:
+    """Match every patch of every tile once.
+
+    Parameters
+    ----------
     part : Roles
     tiles : list of Tile
     correction : PixelMap
@@ -65,13 +89,7 @@ def match_pass(
     there = part.to_surface(correction)
     with ThreadPoolExecutor(threads or part.pair.threads) as pool:
         found = [m for m in pool.map(one, _grouped(tiles, options)) if m is not None]
-    matched = Matched.joined(found)
-    points = observe(part, matched, correction)
-    status = matched.status.copy()
-    status[~np.isfinite(points.covariance).all(axis=(1, 2))] = Status.TEXTURE
-    frame = Frame.of(part.pair)
-    unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
-    return Pass(matched, points, *agreement(points, status, correction, frame, unit))
+    return Matched.joined(found)
 
 
 def _grouped(tiles: list[Tile], options: MatchOptions) -> Iterator[list[Tile]]:

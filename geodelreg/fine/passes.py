@@ -25,7 +25,7 @@ from geodelreg.fit.estimate import Estimate
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Guess, Overview
+from geodelreg.values.points import Guess, Overview, Status
 
 COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
@@ -105,7 +105,8 @@ def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) ->
         return None
     (tiles, size), near, last = read, proof.estimate.map, proof
     options, some = MatchOptions(size=size), _some_of(tiles)
-    tuning = replace(tuning, sigma=fit_sigma(part, some, proof, tuning, size))
+    agreed = proof.matched.template_px[proof.status == Status.KEPT]
+    tuning = replace(tuning, sigma=fit_sigma(part, some, near, agreed, tuning, size))
     if _are_coarse(part, overview_tile(part, images)):
         last = match_pass(part, some, near, tuning, options)
     found = Refinement(part, some, tuning, last, size)
@@ -282,7 +283,8 @@ def _approach(
         tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness
-            sigma = fit_sigma(part, tiles, found, tuning, options.size)
+            agreed = found.matched.template_px[found.status == Status.KEPT]
+            sigma = fit_sigma(part, tiles, near, agreed, tuning, options.size)
             tuning = replace(tuning, sigma=sigma)
         found = match_pass(part, tiles, near, tuning, options)
         if found.estimate is None:

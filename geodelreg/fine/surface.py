@@ -180,6 +180,7 @@ def sample_patches(
     anchor: FloatArray,
     linear: FloatArray,
     offsets: FloatArray,
+    bend: FloatArray | None = None,
 ) -> tuple[Float32Array, BoolArray]:
     """Values on a small lattice around each of many anchors, each on a surface of its own.
 
@@ -195,6 +196,8 @@ def sample_patches(
         Lattice steps to full-raster pixels, per anchor.
     offsets : (K, 2) float64
         The lattice.
+    bend : (P, 2, 3) float64, optional
+        Second derivatives by lattice steps: along columns, mixed, and along rows.
 
     Returns
     -------
@@ -207,6 +210,11 @@ def sample_patches(
     origin32 = origin.astype(np.float32)
     x = steps[:, 0, :] @ grid + origin32[:, 0, None]
     y = steps[:, 1, :] @ grid + origin32[:, 1, None]
+    if bend is not None:
+        square = np.stack([grid[0] ** 2 / 2, grid[0] * grid[1], grid[1] ** 2 / 2])
+        curved = np.matmul(m[:, :, :2], bend).astype(np.float32) @ square
+        x += curved[:, 0]
+        y += curved[:, 1]
     return _look_up(surfaces, owner, x, y)
 
 

@@ -25,6 +25,7 @@ _MEMO = 1
 SMALLEST_PATCH_PX = 12  # square; unexplained: ablate
 _WANTED_PATCHES = 40  # five times what the gate asks; unexplained: ablate
 _MOST_TILES_PER_AXIS = 7  # unexplained: ablate
+_DENSE_TILES_PER_AXIS = 36  # of a patch each: as many points as a field is quickly solved for
 _USUAL_SIGMA = 0.7  # of a template pixel, the largest point spread that is usual
 _LOW_PASS_REACH = 4.0
 _SLACK_PX = 3.0
@@ -71,7 +72,7 @@ def patch_size(visible_px: float) -> int:
     return int(np.clip(round(float(side)), SMALLEST_PATCH_PX, PATCH_PX))
 
 
-def plan_tiles(region: Window, part: Roles) -> list[Window]:
+def plan_tiles(region: Window, part: Roles, dense: bool = False) -> list[Window]:
     """Template windows to visit: adjoining where there are few, else spread evenly.
 
     Tiles of many surface pixels are made smaller, so that all of them fit in memory.
@@ -81,6 +82,8 @@ def plan_tiles(region: Window, part: Roles) -> list[Window]:
     region : Window
         Of the template, as from `geodelreg.pair.overlap_in_template`.
     part : Roles
+    dense : bool
+        Many small ones instead of few large ones: what is between them is asked for, too.
 
     Returns
     -------
@@ -90,16 +93,18 @@ def plan_tiles(region: Window, part: Roles) -> list[Window]:
     step, ratio = part.step, part.surface_px_per_patch_px
     size = patch_size(region.width * region.height / step**2)
     patches = _SPREAD_TILE_PATCHES if ratio < _FINE_RATIO else _SPREAD_TILE_PATCHES_FINE
-    columns = _spans(region.column, region.width, size * step, patches)
-    rows = _spans(region.row, region.height, size * step, patches)
+    if dense:
+        patches = 1
+    columns = _spans(region.column, region.width, size * step, patches, dense)
+    rows = _spans(region.row, region.height, size * step, patches, dense)
     return [Window(x, y, width, height) for y, height in rows for x, width in columns]
 
 
-def _spans(offset: int, length: int, size: int, patches: int) -> list[tuple[int, int]]:
+def _spans(offset: int, length: int, size: int, patches: int, dense: bool) -> list[tuple[int, int]]:
     """(start, length) of the tiles along one axis; adjoining ones hold whole patches."""
-    tile = size * patches
-    if length > _MOST_TILES_PER_AXIS * size * _SPREAD_TILE_PATCHES:
-        gaps = np.linspace(0, length - tile, _MOST_TILES_PER_AXIS)
+    tile, most = size * patches, _DENSE_TILES_PER_AXIS if dense else _MOST_TILES_PER_AXIS
+    if length > most * size * (1 if dense else _SPREAD_TILE_PATCHES):
+        gaps = np.linspace(0, length - tile, most)
         return [(offset + round(float(gap)), tile) for gap in gaps]
     tile, usable = size * _ADJOINING_TILE_PATCHES, length // size * size
     first = offset + (length - usable) // 2

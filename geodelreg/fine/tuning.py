@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fine.layers import Pass
 from geodelreg.fine.surface import Surface, high_pass, make_surface, sample
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tone import SyntheticPan, fit_synthetic_pan, single_band
@@ -15,7 +14,6 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Status
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Grid
 
 DEFAULT_SIGMA = 0.5
@@ -131,14 +129,20 @@ def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Su
     return templates, surface
 
 
-def fit_sigma(part: Roles, tiles: list[Tile], near: Pass, tuning: Tuning, size: int) -> float:
+def fit_sigma(
+    part: Roles,
+    tiles: list[Tile],
+    correction: PixelMap,
+    agreed: FloatArray,
+    tuning: Tuning,
+    size: int,
+) -> float:
     """Low-pass with which the finer image resembles the coarser one most, in template pixels.
 
-    Judged where patches of `size` pixels agreed in the pass before: clouds have a sharpness, too.
+    Judged where patches of `size` pixels agreed in the pass before, whose (N, 2) centres are given:
+    clouds have a sharpness, too.
     """
-    assert near.estimate is not None
-    there = part.to_surface(near.estimate.map)
-    agreed = near.matched.template_px[near.status == Status.KEPT]
+    there = part.to_surface(correction)
     count = max(_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
     per_tile = max(_SAMPLES // len(chosen), LEAST_SAMPLES)

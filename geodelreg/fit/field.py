@@ -1,20 +1,19 @@
-"""A map that no affine holds: an affine trend plus a smooth residual (universal kriging).
+"""Fitting a field: kernel by restricted likelihood, points judged by what the others predict.
 
-The residual is a Gaussian process with a Matérn 5/2 kernel, twice differentiable as terrain, jitter
-and lens distortion are; what a patch shows beyond it is its own noise: its covariance and a nugget.
 Range, amplitudes and nugget maximise the restricted likelihood of the patches (Patterson & Thompson
 1971, doi:10.1093/biomet/58.3.545; Rasmussen & Williams 2006, chapters 2 and 5).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geodelreg.fit.choice import FOLDS, fold_numbers, spatial_blocks
 from geodelreg.fit.estimate import Observations
-from geodelreg.values.raster import FloatArray, IntArray
+from geodelreg.geo.maps.field import FieldMap, Kernel, distances, solve_axis
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 FEWEST_POINTS = 12
 """Twice the parameters of the trend of both axes: fewer leave nothing to tell noise by."""
@@ -23,200 +22,50 @@ MOST_STRAIN = 0.04
 _STUDENT_DOF = 6.0  # unexplained: ablate
 _REJECT_D2 = 25.0  # unexplained: ablate
 _ROUNDS = 3
-_TUNING_POINTS = 200  # unexplained: ablate
+_TUNING_POINTS = 240  # unexplained: ablate
 _LEAST_VARIANCE_PX2 = 1e-8  # unexplained: ablate
-_JITTER = 1e-9  # unexplained: ablate
-_AT_ONCE = 20_000  # unexplained: ablate
 _IMPOSSIBLE = 1e12  # unexplained: ablate
 _LEAST_NUGGET_PX2 = 1e-7  # unexplained: ablate
 _STEPS = 20  # unexplained: ablate
 _CLOSE = 1e-6  # relative; unexplained: ablate
 _STEP = 1e-3  # of a logarithm; unexplained: ablate
-_MATERN = 5.0  # twice the order 5/2
 _DIGITS = 2  # of the logarithms of a kernel: a percent, far below what points tell of it
 
 
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """How residual and noise vary.
-
-    Attributes
-    ----------
-    range_px : float
-        Distance scale of the Matérn 5/2 correlation, source pixels.
-    variance_px2 : (float, float)
-        Of the residual, along columns and rows.
-    nugget_px2 : float
-        Variance per axis that every patch has besides its own covariance.
-    """
-
-    range_px: float
-    variance_px2: tuple[float, float]
-    nugget_px2: float
-
-    def correlation(self, distance_px: FloatArray) -> FloatArray:
-        """Of the residual at places so far apart."""
-        scaled = np.sqrt(_MATERN) / self.range_px * distance_px
-        return np.asarray((1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled))
-
-
-@dataclass(frozen=True, eq=False)
-class Field:
-    """A fitted field: source pixels to header pixels.
-
-    Attributes
-    ----------
-    points : Observations
-        That it stands on.
-    kernel : Kernel
-    weight : (N,) float64
-        Student weights of the points.
-    """
-
-    points: Observations
-    kernel: Kernel
-    weight: FloatArray
-
-    def forward(self, xy: FloatArray) -> FloatArray:
-        """(..., 2) header pixels of (..., 2) source pixels."""
-        flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
-        out = flat.copy()
-        for start in range(0, len(flat), _AT_ONCE):
-            some = slice(start, start + _AT_ONCE)
-            near, columns = self._near(flat[some]), self._columns(flat[some])
-            for number, axis in enumerate(self.axes):
-                out[some, number] += axis.predict(near, columns)
-        return out.reshape(np.shape(xy))
-
-    def joint_covariance(self, xy: FloatArray) -> FloatArray:
-        """(2, M, M) covariance of each component between M points, source pixels squared."""
-        near, columns = self._near(xy), self._columns(xy)
-        prior = self._between(xy, xy)
-        parts = []
-        for axis in self.axes:
-            known, lack = axis.unknown(near, columns)
-            parts.append(axis.variance * prior - known.T @ known + lack.T @ lack)
-        return np.stack(parts)
-
-    def left_out(self) -> tuple[FloatArray, FloatArray]:
-        """Leave-one-out residuals of the points and their variances without noise, (N, 2) each.
-
-        The variances are those of the predictions, to which the points' own noise comes.
-        """
-        parts = [axis.left_out() for axis in self.axes]
-        residual, variance = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
-        noise = np.stack([axis.noise for axis in self.axes], axis=1)
-        return residual, variance - noise
-
-    def cost(self) -> float:
-        """Minus twice the logarithm of the restricted likelihood, up to a constant."""
-        return sum(axis.cost() for axis in self.axes)
-
-    @cached_property
-    def axes(self) -> tuple[_Axis, _Axis]:
-        """The equations of columns and rows, solved."""
-        xy = self.points.source
-        columns, correlation = self._columns(xy), self._between(xy, xy)
-        one, other = (
-            _solve(self.points, self.weight, self.kernel, columns, correlation, axis)
-            for axis in (0, 1)
-        )
-        return one, other
-
-    def _columns(self, xy: FloatArray) -> FloatArray:
-        """(N, 3) trend: an affine."""
-        low, high = self.points.source.min(axis=0), self.points.source.max(axis=0)
-        span = max(float((high - low).max()) / 2, 1.0)
-        return np.column_stack([np.ones(len(xy)), (xy - (low + high) / 2) / span])
-
-    def _near(self, xy: FloatArray) -> FloatArray:
-        return self._between(self.points.source, xy)
-
-    def _between(self, one: FloatArray, other: FloatArray) -> FloatArray:
-        """(N, M) correlation of the residual between places."""
-        return self.kernel.correlation(distances(one, other))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Axis:
-    """The kriging equations of one component, whitened: factors, trend and what it leaves."""
+class FieldFit:
+    """A field with what became of each point.
 
-    variance: float
-    noise: FloatArray
-    factor: FloatArray
-    design: FloatArray
-    normal: FloatArray
-    beta: FloatArray
-    white: FloatArray
-    alpha: FloatArray
+    Attributes
+    ----------
+    field : FieldMap
+        Standing on the points that the others predict well enough.
+    weight : (K,) float64
+        Student weights of those points.
+    inlier : (N,) bool
+        Which of all points they are.
+    distance2 : (N,) float64
+        Squared distance of each point from what the others predict, in variances; 2 on average.
+    """
 
-    def cost(self) -> float:
-        logs = np.log(np.diag(self.factor)).sum() + np.log(np.diag(self.normal)).sum()
-        return float(2.0 * logs + self.white @ self.white)
-
-    def predict(self, near: FloatArray, columns: FloatArray) -> FloatArray:
-        return np.asarray(columns @ self.beta + self.variance * (near.T @ self.alpha))
-
-    def unknown(self, near: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """White parts of the error's covariance: known by the points, and lacking in the trend."""
-        known = _lower(self.factor, self.variance * near)
-        return known, _lower(self.normal, columns.T - self.design.T @ known)
-
-    def left_out(self) -> tuple[FloatArray, FloatArray]:
-        half = _lower(self.factor, np.eye(len(self.noise)))
-        trend = _lower(self.normal, self.design.T @ half)
-        precision = (half**2).sum(axis=0) - (trend**2).sum(axis=0)
-        return self.alpha / precision, 1.0 / precision
+    field: FieldMap
+    weight: FloatArray
+    inlier: BoolArray
+    distance2: FloatArray
 
 
-def _solve(
-    points: Observations,
-    weight: FloatArray,
-    kernel: Kernel,
-    columns: FloatArray,
-    correlation: FloatArray,
-    axis: int,
-) -> _Axis:
-    from scipy.linalg import cho_solve, cholesky, solve_triangular
-
-    variance = kernel.variance_px2[axis]
-    noise = (points.covariance[:, axis, axis] + kernel.nugget_px2) / weight
-    total = variance * correlation
-    total[np.diag_indices_from(total)] += noise + _JITTER * variance
-    factor = cholesky(total, lower=True, check_finite=False, overwrite_a=True)
-    design = _lower(factor, columns)
-    white = _lower(factor, points.target[:, axis] - points.source[:, axis])
-    normal = cholesky(design.T @ design, lower=True)
-    beta = cho_solve((normal, True), design.T @ white)
-    white = white - design @ beta
-    alpha = solve_triangular(factor, white, lower=True, trans=1, check_finite=False)
-    return _Axis(variance, noise, factor, design, normal, beta, white, alpha)
-
-
-def _lower(factor: FloatArray, right: FloatArray) -> FloatArray:
-    from scipy.linalg import solve_triangular
-
-    return np.asarray(solve_triangular(factor, right, lower=True, check_finite=False))
-
-
-def distances(one: FloatArray, other: FloatArray) -> FloatArray:
-    """(N, M) distances between (N, 2) and (M, 2) points."""
-    gap2 = (one[:, None, 0] - other[None, :, 0]) ** 2
-    gap2 += (one[:, None, 1] - other[None, :, 1]) ** 2
-    return np.asarray(np.sqrt(gap2))
-
-
-def fit_field(points: Observations) -> Field:
+def fit_field(
+    points: Observations, start: Kernel | None = None, jumps: tuple[float, ...] = ()
+) -> FieldFit:
     """Fit a field robustly: points are judged by what the others predict where they are.
 
     Parameters
     ----------
     points : Observations
-
-    Returns
-    -------
-    Field
-        Standing on the points that the others predict well enough.
+    start : Kernel, optional
+        Of a fit to nearly the same points; saves time.
+    jumps : tuple of float
+        Rows at which the images are cut.
 
     Raises
     ------
@@ -230,11 +79,12 @@ def fit_field(points: Observations) -> Field:
         raise ValueError("points on a line cannot determine a field")
     inlier, weight = np.ones(len(points), dtype=bool), np.ones(len(points))
     distance2 = np.zeros(len(points))
-    kernel = _first_guess(points)
-    for _ in range(_ROUNDS):
+    kernel = start or _first_guess(points)
+    for number in range(_ROUNDS):
         kept = points.take(inlier)
-        kernel = _tuned(_thinned(kept, kernel, weight[inlier]))
-        field = Field(kept, kernel, weight[inlier])
+        if number == 0 or start is None:
+            kernel = tuned(kept, kernel, weight[inlier], jumps).kernel
+        field = field_of(kept, kernel, weight[inlier], jumps)
         residual, variance = field.left_out()
         own = np.stack([kept.covariance[:, i, i] + kernel.nugget_px2 for i in (0, 1)], axis=1)
         distance2[inlier] = (residual**2 / (variance + own)).sum(axis=1)
@@ -243,14 +93,73 @@ def fit_field(points: Observations) -> Field:
         if (inlier & enough).sum() < FEWEST_POINTS:
             break
         inlier = inlier & enough
-    return Field(points.take(inlier), kernel, weight[inlier])
+    field = field_of(points.take(inlier), kernel, weight[inlier], jumps)
+    return FieldFit(field, weight[inlier], inlier, distance2)
 
 
-def _thinned(points: Observations, kernel: Kernel, weight: FloatArray) -> Field:
-    """A field of some hundred of the points, evenly picked: enough to tune a kernel by."""
-    step = -(-len(points) // _TUNING_POINTS)
-    some: IntArray = np.arange(0, len(points), step)
-    return Field(points.take(some), kernel, weight[some])
+def field_of(
+    points: Observations, kernel: Kernel, weight: FloatArray, jumps: tuple[float, ...] = ()
+) -> FieldMap:
+    """The field through points whose noise is divided by (N,) weights."""
+    own = points.covariance[:, (0, 1), (0, 1)] + kernel.nugget_px2
+    return FieldMap(points.source, points.target, own / weight[:, None], kernel, jumps)
+
+
+def tuned(
+    points: Observations, kernel: Kernel, weight: FloatArray, jumps: tuple[float, ...] = ()
+) -> FieldMap:
+    """The field of greatest restricted likelihood on some hundred of the points.
+
+    Parameters
+    ----------
+    points : Observations
+    kernel : Kernel
+        The first guess.
+    weight : (N,) float64
+    jumps : tuple of float
+    """
+    from scipy.optimize import minimize
+
+    mixed: IntArray = np.random.default_rng(len(points)).permutation(len(points))
+    some = np.sort(mixed[:_TUNING_POINTS])
+    points, weight = points.take(some), weight[some]
+    first = field_of(points, kernel, weight, jumps)
+    extent = float(np.ptp(points.source, axis=0).max())
+    columns, apart = first.columns(points.source), distances(points.source, points.source)
+    together = first.correlation > 0 if jumps else None
+    move = points.target - points.source
+    own = points.covariance[:, (0, 1), (0, 1)]
+
+    def kernel_of(theta: FloatArray) -> Kernel:
+        range_px, one, other, nugget = (float(value) for value in np.exp(theta))
+        return Kernel(range_px, (one, other), nugget)
+
+    def cost(theta: FloatArray) -> float:
+        trial = kernel_of(theta)
+        correlation = trial.correlation(apart)
+        if together is not None:
+            correlation *= together
+        noise = (own + trial.nugget_px2) / weight[:, None]
+        try:
+            return sum(
+                solve_axis(
+                    columns, correlation, move[:, i], noise[:, i], trial.variance_px2[i]
+                ).cost()
+                for i in (0, 1)
+            )
+        except np.linalg.LinAlgError:
+            return _IMPOSSIBLE
+
+    most = (MOST_STRAIN * extent) ** 2
+    low = np.log([_spacing(points), *3 * [_LEAST_VARIANCE_PX2]])
+    high = np.log([max(extent, 2 * _spacing(points)), most, most, most])
+    start = np.log([kernel.range_px, *kernel.variance_px2, kernel.nugget_px2])
+    found = minimize(
+        cost,
+        np.clip(start, low, high), method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": _STEPS, "ftol": _CLOSE, "eps": _STEP},
+    )  # fmt: skip
+    return field_of(points, kernel_of(np.round(found.x, _DIGITS)), weight, jumps)
 
 
 def _first_guess(points: Observations) -> Kernel:
@@ -270,43 +179,34 @@ def _spacing(points: Observations) -> float:
     return float(np.sqrt(extent[0] * extent[1] / len(points)))
 
 
-def _tuned(field: Field) -> Kernel:
-    """Kernel of greatest restricted likelihood.
+def held_out_errors(field: FieldMap) -> FloatArray:
+    """(N, 2) errors of the field at its points, each predicted without all of its block.
 
-    Parameters
-    ----------
-    field : Field
-        Its kernel is the first guess.
+    NaN where too few points are left.  The kernel is that of all points: four numbers of hundreds.
     """
-    from scipy.optimize import minimize
+    folds = fold_numbers(field.source)
+    error = np.full((len(folds), 2), np.nan)
+    for fold in range(FOLDS):
+        out = folds == fold
+        if out.any() and (~out).sum() >= FEWEST_POINTS:
+            error[out] = _without(field, out).forward(field.source[out]) - field.target[out]
+    return error
 
-    points, weight = field.points, field.weight
-    extent = float(np.ptp(points.source, axis=0).max())
-    columns = field._columns(points.source)
-    apart = distances(points.source, points.source)
 
-    def kernel(theta: FloatArray) -> Kernel:
-        range_px, one, other, nugget = (float(value) for value in np.exp(theta))
-        return Kernel(range_px, (one, other), nugget)
+def halves_apart(field: FieldMap) -> float:
+    """Largest distance over the points between fields through two disjoint halves, over two.
 
-    def cost(theta: FloatArray) -> float:
-        trial = kernel(theta)
-        correlation = trial.correlation(apart)
-        try:
-            return sum(
-                _solve(points, weight, trial, columns, correlation, axis).cost() for axis in (0, 1)
-            )
-        except np.linalg.LinAlgError:
-            return _IMPOSSIBLE
+    The halves interleave, so that both cover the scene.
+    """
+    odd = np.argsort(np.argsort(spatial_blocks(field.source), kind="stable")) % 2 == 0
+    if min(int(odd.sum()), int((~odd).sum())) < FEWEST_POINTS:
+        return float("inf")
+    one, other = (_without(field, half).forward(field.source) for half in (odd, ~odd))
+    return float(np.hypot(*(one - other).T).max() / 2)
 
-    most = (MOST_STRAIN * extent) ** 2
-    low = np.log([_spacing(points), *3 * [_LEAST_VARIANCE_PX2]])
-    high = np.log([max(extent, 2 * _spacing(points)), most, most, most])
-    first = field.kernel
-    start = np.log([first.range_px, *first.variance_px2, first.nugget_px2])
-    found = minimize(
-        cost,
-        np.clip(start, low, high), method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": _STEPS, "ftol": _CLOSE, "eps": _STEP},
-    )  # fmt: skip
-    return kernel(np.round(found.x, _DIGITS))
+
+def _without(field: FieldMap, out: BoolArray) -> FieldMap:
+    """The same kernel on the other points."""
+    return replace(
+        field, source=field.source[~out], target=field.target[~out], noise_px2=field.noise_px2[~out]
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.field import Field
+from geodelreg.geo.maps.field import FieldMap
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, FloatArray, IntArray
 
@@ -40,7 +40,7 @@ class Residual:
 
 
 def residual_of(
-    field: Field, correction: PixelMap, xy: FloatArray, scale: FloatArray, seed: int = 0
+    field: FieldMap, correction: PixelMap, xy: FloatArray, scale: FloatArray, seed: int = 0
 ) -> Residual:
     """Size of what a correction leaves of a field, by conditional simulation.
 
@@ -49,7 +49,7 @@ def residual_of(
 
     Parameters
     ----------
-    field : Field
+    field : FieldMap
     correction : PixelMap
         Source pixels to header pixels.
     xy : (N, 2) float64

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from geodelreg.fine.motions import LEAST_SHARE
+from geodelreg.fit.field import FEWEST_POINTS, MOST_STRAIN
 from geodelreg.options import AlignOptions
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
@@ -86,6 +87,8 @@ class Evidence:
         errors.
     bands_words : str
         Which bands, and how they lie.
+    strain : float
+        Largest of a field, at its points and over the raster; 0 of what is none.
     """
 
     points: int
@@ -107,6 +110,7 @@ class Evidence:
     words: str = ""
     bands: float = 0.0
     bands_words: str = ""
+    strain: float = 0.0
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -125,10 +129,12 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     where = f": {evidence.words}" if evidence.words else ""
     which = f": {evidence.bands_words}" if evidence.bands_words else ""
     most_px = options.max_residual_px if options.on_local == "refuse" else None
+    strained = MOST_STRAIN if evidence.strain else None
     whole = (
         ("bands", "≤", MAX_BANDS_PX, f"PAN px at least between the places of two MS bands{which}"),
+        ("strain", "≤", strained, "strain of the field, which so steep would fold the ground"),
         ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
-        ("local", "≤", most_px, "PAN px RMS at least is left by one affine of the ground's bend"),
+        ("local", "≤", most_px, "PAN px RMS at least is left of the ground's bend"),
     )
     values = asdict(evidence) | {
         "tie_points": evidence.points,
@@ -157,6 +163,12 @@ def nothing_agrees() -> Reason:
     """The reason when no transformation was found at all."""
     message = "no transformation was found that enough places agree on"
     return Reason("tie_points", 0.0, float(MIN_POINTS), False, message)
+
+
+def too_few_for_a_field(points: int) -> Reason:
+    """The reason when a field was asked for that the tie points do not determine."""
+    message = f"{points} tie points that agree determine no field (needs ≥ {FEWEST_POINTS})"
+    return Reason("field_points", float(points), float(FEWEST_POINTS), False, message)
 
 
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:

@@ -16,10 +16,12 @@ from geodelreg.fine.overlay import overlay
 from geodelreg.fine.passes import Refinement
 from geodelreg.fine.survey import REACH_PX, Places, survey
 from geodelreg.fine.tone import single_band
+from geodelreg.fit.choice import Fitted
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.field import FEWEST_POINTS, Field, fit_field
+from geodelreg.fit.field import FEWEST_POINTS, fit_field
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
+from geodelreg.geo.maps.field import FieldMap
 from geodelreg.judge.evidence import decimated
 from geodelreg.judge.verdict import Evidence
 from geodelreg.judge.words import lies, region
@@ -39,6 +41,7 @@ _SURE_Z = 3.0
 _SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
 _MOST_POINTS = 1000  # unexplained: ablate
 _PLACES = 200  # unexplained: ablate
+_STRAIN_PLACES = 33  # along either axis of the raster
 _VISIBLE = 3  # bands, as they are usually ordered
 
 
@@ -58,8 +61,10 @@ class Whole:
         Where they lie; empty where there are none.
     clouds : float
         Share of the patches that move and that clouds explain.
-    field : Field or None
+    field : FieldMap or None
         The ground's smooth map, where the patches did not all agree.
+    strain : float
+        Largest of the field, where that is what is written; else 0.
     """
 
     residual: Residual
@@ -67,7 +72,8 @@ class Whole:
     moved: float = 0.0
     words: str = ""
     clouds: float = 0.0
-    field: Field | None = None
+    field: FieldMap | None = None
+    strain: float = 0.0
 
     def is_bent(self, options: AlignOptions) -> bool:
         """True when those that agree leave more of the ground's bend than is allowed."""
@@ -91,22 +97,40 @@ class Whole:
             residual_interval_px=(left.low_px, left.high_px),
         )
         return accuracy, replace(
-            evidence, residual_low_px=low_px, moved=self.moved, words=self.words
+            evidence,
+            residual_low_px=low_px,
+            moved=self.moved,
+            words=self.words,
+            strain=self.strain,
         )
 
     def warnings(self, options: AlignOptions) -> tuple[str, ...]:
         """What a user should be warned of that only all patches together show."""
         notes: list[str] = []
         left, most = self.residual, options.max_residual_px
+        follower = "the field" if self.strain else "one affine"
         if max(left.rms_px, left.high_px) > most:
             notes.append(
                 f"{left.rms_px:.2g} PAN px RMS of the ground's bend are left (95 %: "
                 f"{left.low_px:.2g} to {left.high_px:.2g}), the limit is {most:g}: relief, a "
-                "moving sensor or dropped rows, which one affine does not follow"
+                f"moving sensor or dropped rows, which {follower} does not follow"
             )
+        if self.strain and self.field is not None and self.field.jumps:
+            rows = " and ".join(f"{row:.0f}" for row in self.field.jumps)
+            notes.append(f"MS jumps at row {rows}: the field is cut there")
         if self.clouds:
             notes.append(f"{self.clouds:.0%} of the patches move and look like clouds: left out")
         return tuple(notes)
+
+    def followed(self, pair: Pair, fitted: Fitted) -> Whole:
+        """The same of a field, which leaves what neighbouring patches still share."""
+        points, field = fitted.points, fitted.map
+        if not isinstance(field, FieldMap):
+            return self
+        near = shared_by_neighbours(points.source_px[points.kept], points.residual_px[points.kept])
+        places = np.concatenate([field.source, pair.source_lattice(_STRAIN_PLACES)])
+        strain = float(field.strain_at(places)[0].max())
+        return replace(self, residual=near, field=field, strain=strain)
 
     def under(self, pair: Pair, correction: PixelMap) -> Whole:
         """The same of another correction."""
@@ -254,14 +278,14 @@ def _bent(
     some = np.flatnonzero(member)[:: 1 + int(member.sum()) // _MOST_POINTS]
     if len(some) < FEWEST_POINTS or not np.ptp(points.source[some], axis=0).min() > 0:
         return agreed
-    field = fit_field(points.take(some))
+    field = fit_field(points.take(some)).field
     ground = np.zeros(len(last.status), dtype=np.bool_)
     ground[matched] = member[: len(matched)]
     return Whole(_left(pair, field, correction), ground, field=field)
 
 
-def _left(pair: Pair, field: Field, correction: PixelMap) -> Residual:
-    at = field.points.source
+def _left(pair: Pair, field: FieldMap, correction: PixelMap) -> Residual:
+    at = field.source
     at = at[:: 1 + len(at) // _PLACES]
     return residual_of(field, correction, at, _in_pan(pair))
 

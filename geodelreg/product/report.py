@@ -273,12 +273,15 @@ def next_line(alignment: Alignment, written: WriteOptions | None = None) -> str:
     written = written or WriteOptions()
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Next: use the raster as it is."
-    if not alignment.fits_a_header:
-        return "Next: no geotransform holds this correction: pass control points on (--gcps)."
     if written.georef == "gcps":
         return "Next: OUT has control points and no grid; gdalwarp makes one of them."
     if written.warp:
         return "Next: the resampled grid is north-up, ready for pansharpening with PAN."
+    if not alignment.fits_a_header:
+        return (
+            "Next: no geotransform holds this correction: resample with it (--warp), or pass "
+            "control points on (--gcps)."
+        )
     original, corrected = alignment.correction.original, alignment.correction.corrected
     if corrected.b or corrected.d:
         remedy = "for them add --warp"

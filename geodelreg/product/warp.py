@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from affine import Affine
+from numpy.typing import NDArray
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
+from geodelreg.geo.grid import outline
+from geodelreg.geo.maps.header import header_map
+from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
@@ -23,11 +27,13 @@ from geodelreg.product.atomic import staged
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Provenance
+from geodelreg.product.lookup import Lookup, looked_up, make_lookup
 from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
 from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
 from geodelreg.product.view import corrected_view
-from geodelreg.values.raster import Grid
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.raster import BoolArray, Grid
 from geodelreg.values.result import Correction
 
 TOLERANCE_PX = 1e-3
@@ -35,6 +41,7 @@ TOLERANCE_PX = 1e-3
 
 _BLOCK_PX = 256
 _SNAP_PX = 1e-6
+_EDGE_PLACES = 64  # on each edge of a footprint: what bends curves it
 _EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
 """Of resamplings whose name in rasterio is not GDAL's."""
@@ -53,6 +60,13 @@ class Validity:
     def is_mask(self) -> bool:
         """Neither a value nor the alpha band."""
         return self.nodata is None and self.alpha_band is None
+
+    def missing(self, data: NDArray[Any]) -> BoolArray:
+        """(B or 1, H, W) where (B, H, W) pixels have no value; of a mask it is the last band."""
+        if self.nodata is None:
+            band = data[-1 if self.alpha_band is None else self.alpha_band - 1]
+            return np.asarray(band == 0)[None]
+        return np.isnan(data) if math.isnan(self.nodata) else np.asarray(data == self.nodata)
 
     @classmethod
     def of(cls, dataset: Any) -> Validity:
@@ -77,8 +91,9 @@ def write_warped(
     tags: Mapping[str, str],
     options: WriteOptions,
     reference_path: Path | None = None,
+    placement: PixelMap | None = None,
 ) -> list[str]:
-    """Resample the corrected source raster north-up through GDAL's warper.
+    """Resample the corrected source raster north-up through GDAL's warper, once.
 
     Pixels that the source does not cover get its no-data value, or zero alpha, or are masked;
     float rasters that have none of these get NaN.  Colour tables and quality bands are resampled by
@@ -97,6 +112,9 @@ def write_warped(
     options : WriteOptions
     reference_path : Path, optional
         The PAN raster: with its grid the target takes its coordinate epoch, too.
+    placement : PixelMap, optional
+        Pixels of `source` to those of its original header, where no geotransform holds that:
+        ``corrected`` is then not asked.
 
     Returns
     -------
@@ -115,7 +133,7 @@ def write_warped(
     with gdal_session(source):
         check_source(source)
         driver = output_driver(target, options.driver)
-        grid = _target_grid(source, correction, reference, options)
+        grid = _target_grid(source, correction, reference, options, placement)
         model = reference_path if options.warp_grid == "pan" else source
         onto = None if model is None else spatial_reference(model)
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), source)
@@ -128,7 +146,7 @@ def write_warped(
                 draft = out.parent.parent / "scratch" / name
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
-                notes = _warp(source, draft, content, grid, creation, options)
+                notes = _warp(source, draft, content, grid, creation, options, placement)
             settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
             content = Provenance(settled, (), tags)
             kept = keep(onto, draft, target)
@@ -140,7 +158,9 @@ def write_warped(
     return notes
 
 
-def north_up_grid(correction: Correction, shape: tuple[int, int]) -> Grid:
+def north_up_grid(
+    correction: Correction, shape: tuple[int, int], placement: PixelMap | None = None
+) -> Grid:
     """Grid that covers the corrected footprint with pixels of the original size.
 
     It continues the original grid where that is north-up, so that rasters which shared a grid
@@ -151,10 +171,14 @@ def north_up_grid(correction: Correction, shape: tuple[int, int]) -> Grid:
     correction : Correction
     shape : tuple of int
         Height and width of the raster.
+    placement : PixelMap, optional
+        As for `write_warped`.
     """
-    height, width = shape
-    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=float)
-    places = apply_affine(correction.corrected, corners)
+    edge = outline(Grid(correction.original, shape, correction.crs_wkt), _EDGE_PLACES)
+    if placement is None:
+        places = apply_affine(correction.corrected, edge)
+    else:
+        places = apply_affine(correction.original, placement.forward(edge))
     (left, bottom), (right, top) = places.min(axis=0), places.max(axis=0)
     original = correction.original
     if original.b == 0 and original.d == 0 and original.a > 0 and original.e < 0:
@@ -182,16 +206,19 @@ def _pixel_size(transform: Affine) -> tuple[float, float]:
 
 
 def _target_grid(
-    source: Path, correction: Correction, reference: Grid, options: WriteOptions
+    source: Path,
+    correction: Correction,
+    reference: Grid,
+    options: WriteOptions,
+    placement: PixelMap | None,
 ) -> Grid:
-
     if options.warp_grid == "pan":
         grid = reference
     else:
         with open_raster(source) as dataset:
             shape = dataset.shape
         try:
-            grid = north_up_grid(correction, shape)
+            grid = north_up_grid(correction, shape, placement)
         except (OverflowError, ValueError) as error:
             raise UnsupportedGeoreferenceError(
                 f"the corrected geotransform of {source} is too large to be covered by pixels: "
@@ -208,6 +235,7 @@ def _warp(
     grid: Grid,
     creation: Mapping[str, str],
     options: WriteOptions,
+    placement: PixelMap | None,
 ) -> list[str]:
     import rasterio
 
@@ -219,16 +247,36 @@ def _warp(
             notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
         profile = _profile(view, grid, validity)
         profile |= {key.lower(): value for key, value in creation.items()}
-        with (
-            warped_onto(view, grid, validity, resampling) as warped,
-            warped_onto(view, grid, validity, "nearest") if flags else nullcontext() as nearest,
-            rasterio.open(out, "w", **profile) as dataset,
-        ):
+        lookups = _lookups(placement, content.correction, grid, view.shape)
+        with ExitStack() as stack:
+            parts = []
+            for lookup in lookups:
+                ways = [resampling, *(["nearest"] if flags else [])]
+                plain = [stack.enter_context(warped_onto(view, grid, validity, w)) for w in ways]
+                if lookup is not None:
+                    plain = [stack.enter_context(looked_up(name, one, lookup)) for one in plain]
+                parts.append(plain)
+            dataset = stack.enter_context(rasterio.open(out, "w", **profile))
             _annotate(view, dataset)
-            _copy_pixels(warped, nearest, flags, dataset, validity)
+            _copy_pixels(parts, flags, dataset, validity)
     _copy_overviews(source, out, "nearest" if flags or resampling == "nearest" else "average")
     compare.check_decodable(out)
     return notes
+
+
+def _lookups(
+    placement: PixelMap | None, correction: Correction, grid: Grid, shape: tuple[int, int]
+) -> Sequence[Lookup | None]:
+    """How the pixels of the target are found, for each part of the source that is smooth."""
+    if placement is None:
+        return [None]
+    header = header_map(grid, Grid(correction.original, shape, correction.crs_wkt))
+    found = []
+    for part, first, last in placement.pieces():
+        rows = tuple(round(min(max(row, 0.0), shape[0])) for row in (first, last))
+        if rows[0] < rows[1]:
+            found.append(make_lookup(header.then(Inverse(part)), grid.shape, (rows[0], rows[1])))
+    return found
 
 
 def _resampling(
@@ -333,12 +381,17 @@ def _copy_colormaps(view: Any, dataset: Any) -> None:
 
 
 def _copy_pixels(
-    warped: Any, nearest: Any, flags: Sequence[int], dataset: Any, validity: Validity
+    parts: Sequence[Sequence[Any]], flags: Sequence[int], dataset: Any, validity: Validity
 ) -> None:
+    """Copy window by window; of parts that overlap the first that has a pixel gives it."""
     for window in compare.windows_of(dataset):
-        data = warped.read(window=window)
-        if flags:
-            data[[number - 1 for number in flags]] = nearest.read(list(flags), window=window)
+        data = None
+        for warped, *nearest in parts:
+            here = warped.read(window=window)
+            for flat in nearest:
+                here[[number - 1 for number in flags]] = flat.read(list(flags), window=window)
+            data = here if data is None else np.where(validity.missing(data), here, data)
+        assert data is not None
         dataset.write(data[: dataset.count], window=window)
         if validity.is_mask:
             dataset.write_mask(data[-1] != 0, window=window)

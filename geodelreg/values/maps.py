@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from affine import Affine
@@ -33,6 +34,12 @@ class PixelMap(Protocol):
 
     def as_affine(self) -> Affine | None:
         """The same as an affine transformation; None when it is none."""
+
+    def pieces(self) -> Sequence[tuple[PixelMap, float, float]]:
+        """Smooth maps, and the rows of the domain from and to which each holds, upper ones first.
+
+        One, that holds everywhere, of all maps but those with jumps.
+        """
 
     def to_json(self) -> dict[str, Any]:
         """Kind and numbers, of plain types."""

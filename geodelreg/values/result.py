@@ -85,9 +85,9 @@ REMEDIES = (
     (
         {"local"},
         (
-            "--on-local warn writes the best affine all the same, --max-residual PX allows more; "
-            "a raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
-            "part by part."
+            "--warp writes a field that follows the bend; --on-local warn writes the best affine "
+            "all the same, --max-residual PX allows more; a raster that is bent less in parts can "
+            "be cut (gdal_translate -srcwin) and aligned part by part."
         ),
     ),
     (
@@ -349,7 +349,8 @@ class Alignment:
     @property
     def fits_a_header(self) -> bool:
         """False of a correction that no geotransform can hold."""
-        return self.solution.map.as_affine() is not None
+        moves = self.verdict.outcome is Outcome.ALIGNED
+        return not moves or self.solution.map.as_affine() is not None
 
     @property
     def correction(self) -> Correction:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +60,10 @@ class SmoothMap(ABC):
         """None: not known to be one."""
         return None
 
+    def pieces(self) -> Sequence[tuple[PixelMap, float, float]]:
+        """The map itself, everywhere."""
+        return [(self, -math.inf, math.inf)]
+
     def then(self, other: PixelMap) -> PixelMap:
         """First this map, then the other."""
         return Composed(self, other)
@@ -83,6 +89,22 @@ class Composed(SmoothMap):
         between = self.first.forward(xy)
         grown = self.first.sigma_at(xy) * _magnification(self.second, between)
         return np.asarray(np.hypot(grown, self.second.sigma_at(between)))
+
+    def pieces(self) -> Sequence[tuple[PixelMap, float, float]]:
+        """Those of the second after the first, where that keeps rows apart; of the first as well.
+
+        Jumps of a second map after one that turns rows would be no jumps along rows.
+        """
+        affine = self.first.as_affine()
+        if affine is None:
+            ahead = self.first.pieces()
+            return [(piece.then(self.second), low, high) for piece, low, high in ahead]
+        if affine.d != 0 or affine.e <= 0:
+            return [(self, -math.inf, math.inf)]
+        return [
+            (self.first.then(piece), (low - affine.f) / affine.e, (high - affine.f) / affine.e)
+            for piece, low, high in self.second.pieces()
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Both, in order."""

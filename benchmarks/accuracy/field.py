@@ -1,0 +1,207 @@
+"""Pairs that bend and jump: the field against the known truth, its standard error, its time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.gate.bent_cases import BentPair
+from benchmarks.gate.distortions import Tear, waves
+from benchmarks.processes import measured, own_environment
+from benchmarks.records import Row
+from benchmarks.report import DOCS, machine, replace_section
+from benchmarks.scenes.imagery import Imagery, aerial, sentinel2
+from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
+from benchmarks.scenes.truth import check_points
+
+Array = NDArray[np.float64]
+PAN_PX, MS_PX, RATIO = 2000, 450, 4.0
+TEXTURES = {"satellite": sentinel2, "aerial": aerial}
+AMPLITUDES_PX = (1.0, 2.0, 3.0)
+LENGTHS_PX = (600, 800, 1200, 1600, 2400)
+JUMP = "jump"
+JUMP_PX, JUMP_SHARE = (2.5, 0.6), 0.45
+AWAY_MS_PX = 20.0
+"""From a jump: a row of patches."""
+_TIMEOUT_S = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One pair to make.
+
+    Attributes
+    ----------
+    texture : str
+        One of `TEXTURES`.
+    amplitude_px, length_px : float
+        Of the waves, PAN pixels; 0 and 0 of a jump along a row.
+    """
+
+    texture: str
+    amplitude_px: float
+    length_px: float
+
+    @property
+    def name(self) -> str:
+        """Unique, and the seed."""
+        what = f"{self.amplitude_px:g} px / {self.length_px:g} px" if self.length_px else JUMP
+        return f"{self.texture}, {what}"
+
+    @property
+    def bend(self) -> Bend:
+        """What the pair's header does not express."""
+        if not self.length_px:
+            return Tear(JUMP_PX, JUMP_SHARE, 0.0, (PAN_PX, PAN_PX))
+        seed = round(1000 * self.amplitude_px + self.length_px)
+        return waves(self.amplitude_px, self.length_px, np.random.default_rng(seed))
+
+
+def cases() -> Iterator[Case]:
+    """Every wave on every texture, and a jump on each."""
+    for texture in TEXTURES:
+        for amplitude in AMPLITUDES_PX:
+            yield from (Case(texture, amplitude, length) for length in LENGTHS_PX)
+        yield Case(texture, 0.0, 0.0)
+
+
+def make(case: Case, imagery: Imagery) -> BentPair:
+    """The pair of a case."""
+    error = HeaderError((2.3, -1.7))
+    spec = SceneSpec(case.name, case.name, error, (PAN_PX, PAN_PX), (MS_PX, MS_PX), RATIO)
+    return BentPair(make_scene(spec, imagery, case.bend), case.bend)
+
+
+def run_case(case: Case, pair: BentPair) -> Row:
+    """Align one pair in a process of its own, and compare with the truth.
+
+    Returns
+    -------
+    dict
+        ``rmse_px``, ``median_px``, ``best_affine_px``, ``normalised`` error, ``seconds`` and
+        ``peak_mb`` of the command, which writes its report and no raster.
+    """
+    from geodelreg.geo.maps.parsing import map_of_json
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_scene(pair.scene, folder)
+        command = [
+            sys.executable, "-m", "geodelreg_cli", "align", "ms.tif", "pan.tif", "--dry-run",
+            "--on-local", "field", "--report", "out.json", "--quiet",
+        ]  # fmt: skip
+        usage = measured(command, own_environment(), _TIMEOUT_S, folder)
+        found = json.loads((folder / "out.json").read_text("utf-8"))
+    at = check_points(pair.scene.truth.ms_shape)
+    true = pair.pan_px(at)
+    row: Row = {
+        "case": case.name,
+        "outcome": found["verdict"]["outcome"],
+        "failed": [r["name"] for r in found["verdict"]["reasons"] if not r["passed"]],
+        "model": found["correction"]["model"],
+        "best_affine_px": _rms(pair.errors(pair.best_affine())),
+        "seconds": usage.wall_s,
+        "peak_mb": usage.peak_mb,
+    }
+    written = found["correction"].get("pixel_map")
+    if written is None:
+        return row
+    correction = map_of_json(written)
+    error = _in_pan(pair, correction.forward(at)) - true
+    row["jump_rows"] = written.get("jump_rows", [])
+    if not case.length_px:
+        border = _jump_row(case, pair)
+        row["true_jump_row"] = border
+        error = error[np.abs(at[:, 1] - border) > AWAY_MS_PX]
+        at = at[np.abs(at[:, 1] - border) > AWAY_MS_PX]
+    sigma = RATIO * correction.sigma_at(at)
+    distance = np.hypot(*error.T)
+    return row | {
+        "rmse_px": _rms(error),
+        "median_px": float(np.median(distance)),
+        "normalised": float(np.sqrt(((distance / sigma) ** 2).mean())),
+    }
+
+
+def _in_pan(pair: BentPair, header_px: Array) -> Array:
+    from affine import Affine
+
+    truth = pair.scene.truth
+    return pair.to_pan(truth, Affine(*truth.ms_header), header_px)
+
+
+def _jump_row(case: Case, pair: BentPair) -> float:
+    """MS row at which the content jumps."""
+    rows = np.linspace(0, MS_PX, 40 * MS_PX)
+    at = np.stack([np.full(len(rows), MS_PX / 2), rows], axis=1)
+    step = np.abs(np.diff(pair.pan_px(at), axis=0)).sum(axis=1)
+    return float(rows[np.argmax(step)])
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def table(rows: list[Row]) -> str:
+    """One line a case, as Markdown."""
+    heads = (
+        "case", "result", "best affine, px", "RMSE, px", "median, px", "normalised", "s", "MB"
+    )  # fmt: skip
+    lines = [_line(*heads), "|---" * len(heads) + "|"]
+    for row in rows:
+        result = row["model"] if row["outcome"] == "aligned" else ", ".join(row["failed"])
+        if row.get("jump_rows"):
+            result += f", jump at row {row['jump_rows'][0]:g}"
+        numbers = [_short(row.get(key)) for key in ("rmse_px", "median_px", "normalised")]
+        cost = f"{row['seconds']:.1f}", f"{row['peak_mb']:.0f}"
+        lines.append(_line(row["case"], result, _short(row["best_affine_px"]), *numbers, *cost))
+    return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _line(*cells: object) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``python -m benchmarks field``."""
+    parser.add_argument("--data", type=Path, required=True, help="folder with the real imagery")
+    parser.add_argument("--only", default="", help="cases whose name holds this")
+    parser.add_argument("--docs", action="store_true", help="write the table to docs/benchmarks.md")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the cases; 1 when any is not followed."""
+    textures: dict[str, Imagery] = {}
+    rows = []
+    for case in cases():
+        if args.only not in case.name:
+            continue
+        if case.texture not in textures:
+            textures[case.texture] = TEXTURES[case.texture](args.data)
+        rows.append(run_case(case, make(case, textures[case.texture])))
+        print(table(rows[-1:]).splitlines()[-1], flush=True)
+    waved = [row["rmse_px"] for row in rows if "rmse_px" in row]
+    text = table(rows)
+    if args.docs:
+        about = (
+            f"`python -m benchmarks field`: PAN {PAN_PX}², MS {MS_PX}² at 4:1, waves of so many "
+            f"PAN px and so long, and a jump of {JUMP_PX[0]:g} px along a row (RMSE away from "
+            f'it), on {machine()}.  "Normalised" is the error over its standard error, RMS.  '
+            f"Time and memory are the whole command's, without writing pixels.  Median scene: "
+            f"{np.median(waved):.3f} px."
+        )
+        replace_section(DOCS / "benchmarks.md", "field", f"## Fields\n\n{about}\n\n{text}")
+    return 0 if len(waved) == len(rows) else 1

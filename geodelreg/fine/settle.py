@@ -1,0 +1,180 @@
+"""Matching through a field until it stands still.
+
+Patches matched through a map measure what is left between it and the truth, averaged over their
+area.  Matched through the map that they themselves gave, what is left shrinks, and with it what the
+averaging hides: the field gets sharper than its patches are wide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geodelreg.fine.least_squares import Matched, MatchOptions
+from geodelreg.fine.matching import match_tiles, observe
+from geodelreg.fine.motions import layers
+from geodelreg.fine.passes import Refinement
+from geodelreg.fine.tiles import SMALLEST_PATCH_PX, patch_size, plan_tiles, read_tiles
+from geodelreg.fine.tuning import fit_sigma, fit_tone
+from geodelreg.fit.estimate import Observations
+from geodelreg.fit.field import FEWEST_POINTS, FieldFit, fit_field
+from geodelreg.fit.jumps import find_jumps
+from geodelreg.pair import overlap_in_template
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.points import Status
+from geodelreg.values.raster import FloatArray, IntArray, StatusArray
+
+_MOST_PASSES = 4  # unexplained: ablate
+_TUNED_PASSES = 2  # then tone and point spread are known
+_STANDS_STILL = 0.2  # of its standard error; unexplained: ablate
+_STEEP = 4.0
+"""Patches within which the residual varies, below which smaller ones are tried."""
+_NOISY = 2.0
+"""Scatter over the patches' own errors, above which it may be variation within them."""
+_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
+_ITERATIONS = 5  # of the first pass; unexplained: ablate
+_LATER_ITERATIONS = 3  # unexplained: ablate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Settled:
+    """Where the passes ended.
+
+    Attributes
+    ----------
+    fit : FieldFit
+        Of the patches of the last pass that are the ground's.
+    matched : Matched
+        All patches of the last pass.
+    points : Observations
+        The same, in MS pixels.
+    ground : (G,) intp
+        Those that `fit` was given.
+    refined : Refinement
+        With the tiles, the tuning and the size of the patches.
+    passes : int
+    """
+
+    fit: FieldFit
+    matched: Matched
+    points: Observations
+    ground: IntArray
+    refined: Refinement
+    passes: int
+
+    @property
+    def status(self) -> StatusArray:
+        """(P,) what became of each patch."""
+        status = self.matched.status.copy()
+        rejected = status == Status.KEPT
+        rejected[self.ground] = False
+        status[rejected] = Status.CONSENSUS
+        status[self.ground[~self.fit.inlier]] = Status.RESIDUAL
+        return status
+
+
+def settle(refined: Refinement, start: PixelMap) -> Settled | None:
+    """Match and fit in turn until the field moves by less than it is uncertain.
+
+    Smaller patches are tried where the field bends within few of them.
+
+    Parameters
+    ----------
+    refined : Refinement
+    start : PixelMap
+        MS pixels to MS header pixels.
+
+    Returns
+    -------
+    Settled or None
+        None when too few patches matched.
+    """
+    refined = _everywhere(refined, start)
+    best = _passes(refined, start, refined.size)
+    if best is not None and refined.size > SMALLEST_PATCH_PX and _bends(best):
+        finer = _passes(best.refined, best.fit.field, SMALLEST_PATCH_PX)
+        if finer is not None and _unknown(finer) < _unknown(best):
+            return finer
+    return best
+
+
+def _everywhere(refined: Refinement, start: PixelMap) -> Refinement:
+    """With tiles that leave out neither bright objects, which are the ground's, nor much between.
+
+    Parameters
+    ----------
+    refined : Refinement
+    start : PixelMap
+    """
+    part = refined.part
+    region = overlap_in_template(part, start)
+    if region is None:
+        return refined
+    windows = plan_tiles(region, part, dense=True)
+    if len(windows) == len(plan_tiles(region, part)) and not refined.dark_only:
+        return refined  # adjoining ones
+    tiles = read_tiles(part, windows, start)
+    size = patch_size(region.width * region.height / part.step**2)
+    return replace(refined, tiles=tiles, size=size, dark_only=False) if tiles else refined
+
+
+def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
+    part, tiles, tuning = refined.part, refined.tiles, refined.tuning
+    current, settled = start, None
+    jumps: tuple[float, ...] = ()
+    options = MatchOptions(size, _ITERATIONS, _TOLERANCE, bent=True)
+    for number in range(1, _MOST_PASSES + 1):
+        if number <= _TUNED_PASSES:
+            tone = fit_tone(part, tiles, current, tuning.sigma)
+            tuning = replace(tuning, tone=tone)
+        if settled is not None and number <= _TUNED_PASSES and not tuning.local_tone:
+            agreed = settled.matched.template_px[settled.ground[settled.fit.inlier]]
+            sigma = fit_sigma(part, tiles, current, agreed, tuning, size)
+            tuning = replace(tuning, sigma=sigma)
+        matched = match_tiles(part, tiles, current, tuning, options)
+        points = observe(part, matched, current)
+        good = np.flatnonzero(matched.status == Status.KEPT)
+        good = good[np.isfinite(points.covariance[good]).all(axis=(1, 2))]
+        some = points.take(good)
+        own = np.sqrt(some.covariance.trace(axis1=1, axis2=2))
+        ground = good[layers(some.source, some.target - current.forward(some.source), own) == 0]
+        some = points.take(ground)
+        if len(some) < FEWEST_POINTS or not np.ptp(some.source, axis=0).min() > 0:
+            return settled
+        fit = fit_field(some, None if settled is None else settled.fit.field.kernel, jumps)
+        if settled is None:
+            jumps = find_jumps(some.take(fit.inlier), fit.field.kernel, fit.weight)
+            if jumps:
+                fit = fit_field(some, None, jumps)
+        there = replace(refined, tuning=tuning, size=size)
+        settled = Settled(fit, matched, points, ground, there, number)
+        moved = _rms(fit.field.forward(some.source) - current.forward(some.source))
+        current = fit.field
+        if moved < _STANDS_STILL * _sigma(settled):
+            break
+        options = replace(options, iterations=_LATER_ITERATIONS)
+    return settled
+
+
+def _bends(settled: Settled) -> bool:
+    """True when the field varies within few patches, or what looks like noise may be the field."""
+    kernel = settled.fit.field.kernel
+    covariance = settled.points.covariance[settled.ground]
+    own = float(np.median(covariance.trace(axis1=1, axis2=2))) / 2
+    steep = max(kernel.variance_px2) > own and kernel.range_px < _STEEP * settled.refined.size
+    return steep or kernel.nugget_px2 > _NOISY**2 * own
+
+
+def _unknown(settled: Settled) -> float:
+    """Variance of a new patch against what the field predicts: its error, and the nugget."""
+    return _sigma(settled) ** 2 + 2 * settled.fit.field.kernel.nugget_px2
+
+
+def _sigma(settled: Settled) -> float:
+    """Radial standard error of the field at its patches, RMS."""
+    return float(np.sqrt((settled.fit.field.sigma_at(settled.fit.field.source) ** 2).mean()))
+
+
+def _rms(vectors: FloatArray) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
