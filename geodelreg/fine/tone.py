@@ -260,10 +260,10 @@ def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatA
     weights, correlation, scale = np.zeros(len(x)), 0.0, np.inf
     for round_number in range(_ROUNDS):
         total = max(float(trust.sum()), TINY)
-        trusted = rows * trust
-        mean = trusted.sum(axis=1) / total
+        mean = (rows * trust).sum(axis=1) / total
+        centred = rows - mean[:, None]
         # einsum, for BLAS would wake its threads for products as thin as these
-        second = np.einsum("bn,cn->bc", trusted, rows) - total * np.multiply.outer(mean, mean)
+        second = np.einsum("bn,cn->bc", centred * trust, centred)
         gram, moment, power = second[:-1, :-1], second[:-1, -1], float(second[-1, -1])
         weights = non_negative_weights(gram, moment)
         energy = float(weights @ gram @ weights)
