@@ -271,9 +271,9 @@ def _reweighted(x: FloatArray, y: FloatArray, start: FloatArray) -> tuple[FloatA
     for round_number in range(_ROUNDS):
         total = max(float(trust.sum()), TINY)
         mean = (rows * trust).sum(axis=1) / total
-        apart = rows - mean[:, None]  # first: values that are far from 0 would leave only rounding
+        centred = rows - mean[:, None]
         # einsum, for BLAS would wake its threads for products as thin as these
-        second = np.einsum("bn,cn->bc", apart * trust, apart)
+        second = np.einsum("bn,cn->bc", centred * trust, centred)
         gram, moment, power = second[:-1, :-1], second[:-1, -1], float(second[-1, -1])
         weights = non_negative_weights(gram, moment)
         energy = float(weights @ gram @ weights)

@@ -59,6 +59,20 @@ def test_a_repeated_band_does_no_harm() -> None:
     assert design @ found == pytest.approx(target, abs=1e-5)
 
 
+@pytest.mark.parametrize("levels", [2, 4])
+@pytest.mark.parametrize("seed", range(8))
+def test_bands_of_a_few_grey_levels_are_weighted(levels: int, seed: int) -> None:
+    """Where all that is trusted has one value, rounding must not pass for contrast."""
+    rng = np.random.default_rng(seed)
+    ground = rng.normal(size=4000)
+    noisy = ground + 0.2 * rng.normal(size=(5, 4000))
+    cuts = np.quantile(ground, np.linspace(0, 1, levels + 1)[1:-1])
+    *bands, target = (100 + 200 * np.searchsorted(cuts, band) for band in noisy)
+    weights, correlation = robust_band_weights(np.float32(bands), np.float32(target))
+    assert (weights >= 0).all()
+    assert np.isfinite(correlation)
+
+
 def test_nothing_positive_gives_no_weights() -> None:
     x = bands()
     assert not non_negative_weights(np.eye(3), np.array([-1.0, -0.2, 0.0])).any()
