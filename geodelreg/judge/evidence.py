@@ -17,10 +17,11 @@ from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
-from geodelreg.judge.bands import bands_apart, find_bands
+from geodelreg.judge.bands import bands_apart, find_bands, really_elsewhere
 from geodelreg.judge.in_place import area_evidence
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.judge.verdict import Evidence
+from geodelreg.judge.words import BANDS_TOLD_PX
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
@@ -57,7 +58,11 @@ def gather(
     where = (part, refined.tiles, correction, refined.tuning, refined.size)
     with ThreadPoolExecutor(pair.threads) as pool:
         whole = pool.submit(overlaid)
-        apart = bands_apart(find_bands(guess, refined, correction, pool), pair)
+        bands = find_bands(guess, refined, correction, pool)
+        apart = told = bands_apart(bands, pair)
+        if told.distance_px * pair.pan_px_per_source_px > BANDS_TOLD_PX:
+            moved = really_elsewhere(bands, guess, refined, correction)
+            told = bands_apart(bands, pair, moved)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)
@@ -77,8 +82,8 @@ def gather(
         rival_motion=rival_motion(fitted.points, part.pan_px_per_patch_px),
         support=area.support,
         bands_apart=apart.distance_px * pair.pan_px_per_source_px / part.pan_px_per_patch_px,
-        bands=apart.distance_px * pair.pan_px_per_source_px,
-        bands_words=apart.words,
+        bands=told.distance_px * pair.pan_px_per_source_px,
+        bands_words=told.words,
         keypoints_apart=keypoints_apart(pair, guess, heard, correction, fitted.points),
     )
 

@@ -13,7 +13,7 @@ from geodelreg.values.raster import BoolArray, FloatArray
 
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
-_BANDS_TOLD_PX = 0.5  # of PAN: half of what refuses
+BANDS_TOLD_PX = 0.5  # of PAN: half of what refuses
 _MOSTLY = 0.9  # unexplained: ablate
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
@@ -95,7 +95,7 @@ def local_distortion(points: TiePoints) -> float:
 
 def bands_warning(evidence: Evidence) -> tuple[str, ...]:
     """What to say of MS bands that lie apart; nothing of bands that agree."""
-    if not evidence.bands > _BANDS_TOLD_PX:
+    if not evidence.bands > BANDS_TOLD_PX:
         return ()
     note = (
         f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least)"

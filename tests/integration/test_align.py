@@ -110,7 +110,7 @@ def test_header_errors_are_found(tmp_path: Path, name: str) -> None:
     alignment = align(scene.ms, scene.pan)
     check(scene, alignment)
     assert alignment.correction.model == model
-    warned = any("--warp" in warning for warning in alignment.warnings)
+    warned = any("no longer north-up" in warning for warning in alignment.warnings)
     assert warned == (model in ("similarity", "affine"))
 
 

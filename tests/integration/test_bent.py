@@ -151,7 +151,7 @@ def test_bands_that_lie_apart_are_refused_and_named_however_far(
     apart = bands_apart(tmp_path, shift)
     error, alignment = refusal(apart)
     assert "bands" in failed(alignment)
-    told = re.search(r"Band 3 lies ([\d.]+) px right and ([\d.]+) px down of Band", str(error))
+    told = re.search(r"band 3 lies ([\d.]+) px right and ([\d.]+) px down of band", str(error))
     assert told is not None
     assert [float(number) for number in told.groups()] == pytest.approx(np.negative(shift), abs=0.2)
     assert "--band" in error.remedy
@@ -162,7 +162,7 @@ def test_bands_that_lie_apart_are_refused_and_named_however_far(
 def test_bands_that_lie_a_little_apart_are_warned_of(tmp_path: Path) -> None:
     apart = bands_apart(tmp_path, (0.6, -0.5))
     alignment = geodelreg.align(apart.ms, apart.pan)
-    assert any("MS bands do not agree: Band 3" in warning for warning in alignment.warnings)
+    assert any("MS bands do not agree: band 3" in warning for warning in alignment.warnings)
 
 
 def bands_apart(folder: Path, shift: tuple[float, float]) -> Made:
