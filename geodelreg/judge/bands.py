@@ -114,7 +114,7 @@ def _start(guess: Guess, pair: Pair, band: int, heard: set[int]) -> AffineMap | 
     """Where a band shows what the others show elsewhere: its pixels to theirs; None if nearby."""
     images = guess.images.source
     mine, others = images[band], mean_band([images[number] for number in sorted(heard - {band})])
-    shift = best_shift(Overlay(others.data, mine.data, others.valid, mine.valid))
+    shift = best_shift(Overlay(others.data, mine.data, others.valid, mine.valid)).move
     if not np.hypot(*shift) > _FAR_PX:
         return None
     step = ~pair.source.grid.transform @ mine.grid.transform
