@@ -31,7 +31,7 @@ class Shift(NamedTuple):
     ----------
     move : (2,) float64
         (columns, rows): content of `Overlay.template` at x is that of `Overlay.surface` at x plus
-        this, to about a pixel of the overlay.
+        this, to about half a pixel of the overlay.
     rival : float
         Significance of the best other place over that of this one; near 1 = ambiguous.
     """
@@ -57,12 +57,23 @@ def best_shift(overlay: Overlay) -> Shift:
     scores *= np.sqrt(np.maximum(overlap, 0.0))
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(scores)), scores.shape))
     height, width = one.shape
-    moved = np.array([width - 1 - column, height - 1 - row], dtype=np.float64)
+    across = _vertex(scores[row], column)
+    down = _vertex(scores[:, column], row)
+    moved = np.array([width - 1 - across, height - 1 - down])
     rows, columns = overlay.template.shape
     best = float(scores[row, column])
     scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
     rival = float(scores.max()) / best if best > 0 else 1.0
     return Shift(np.asarray(moved * np.array([columns / width, rows / height])), rival)
+
+
+def _vertex(scores: Float32Array, best: int) -> float:
+    """Where the parabola through the best score and its neighbours is highest."""
+    if not 0 < best < len(scores) - 1:
+        return float(best)
+    before, here, after = (float(score) for score in scores[best - 1 : best + 2])
+    bend = before - 2 * here + after
+    return best + (before - after) / (2 * bend) if bend < 0 else float(best)
 
 
 def around(centre: int, reach: int) -> slice:

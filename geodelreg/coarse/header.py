@@ -57,7 +57,7 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     """The header's place, or a shift from there, when nothing in the images lets one doubt it.
 
     That is when edges correlate there far better than at any other place, when nearly all patches
-    of two passes over the decimated images agree, and when chance would not make so many agree.
+    of one or two passes over the decimated images agree, and when chance would not make so many.
 
     Returns
     -------
@@ -76,6 +76,8 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
         if found.estimate is None:
             return None
         near = found.estimate.map
+        if found.is_calm:
+            break
     surprise = _log_nfa(part, tile, found)
     logger.debug("at the header: rival %.2f, %d agree, log NFA %.1f", rival, found.kept, surprise)
     if not found.is_calm or surprise > SURE_LOG_NFA:
