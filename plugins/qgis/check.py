@@ -3,7 +3,7 @@
 Needs QGIS 3.22 or later with its Python (Debian: ``qgis`` and ``python3-qgis``), and geodelreg with
 its ``dev`` extra in the Python that runs this.  It packs the plugin, installs the zip into an empty
 profile, and compares what ``qgis_process`` writes with what the command line writes.  The rest is
-in ``in_qgis.py``.  With ``--install`` it also makes the environment as a user would, which fetches
+in ``in_qgis``.  With ``--install`` it also makes the environment as a user would, which fetches
 packages.  It takes some minutes.
 """
 
@@ -176,7 +176,7 @@ def main(arguments: list[str]) -> None:
         print(version)
         same_bytes(home, folder)
         # not where it lies: there, the plugin's sources would come before the unpacked zip
-        inside = shutil.copy(Path(__file__).with_name("in_qgis.py"), home)
+        inside = shutil.copytree(Path(__file__).with_name("in_qgis"), home / "in_qgis")
         subprocess.run([PYTHON, inside, str(folder)], env=environment(home, True), check=True)
         if "--install" in arguments:
             install(home, folder)
