@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,9 @@ def qgis_process(home: Path, *words: str, command: bool = True) -> subprocess.Co
     )
 
 
-def run_algorithm(home: Path, name: str, command: bool = True, **parameters: Any) -> str:
+def run_algorithm(
+    home: Path, name: str, parameters: Mapping[str, Path], command: bool = True
+) -> str:
     """Run an algorithm in ``qgis_process``; what it prints."""
     words = [f"{key}={value}" for key, value in parameters.items()]
     done = qgis_process(home, "run", f"geodelreg:{name}", "--", *words, command=command)
@@ -123,7 +126,7 @@ def same_bytes(home: Path, folder: Path) -> None:
             keys, words = {"OUTPUT": here[0]}, ["-o", there[0]]
         else:
             keys, words = {"REPORT": here[0]}, ["--json"]
-        run_algorithm(home, name, MS=ms, PAN=pan, **keys)
+        run_algorithm(home, name, {"MS": ms, "PAN": pan, **keys})
         printed = geodelreg(name, ms, pan, *words, answers=(0, 4))
         if name == "check":
             there[0].write_text(printed, encoding="utf-8")
@@ -145,15 +148,9 @@ def install(home: Path, folder: Path) -> None:
     assert "no geodelreg command" in failed.stdout + failed.stderr
     assert not target.exists()
     print("ok: without geodelreg, align says what to do")
-    print(run_algorithm(home, "install", command=False).strip().splitlines()[-1])
-    run_algorithm(
-        home,
-        "align",
-        command=False,
-        MS=folder / "ms 1.tif",
-        PAN=folder / "pan 1.tif",
-        OUTPUT=target,
-    )
+    print(run_algorithm(home, "install", {}, command=False).strip().splitlines()[-1])
+    pair = {"MS": folder / "ms 1.tif", "PAN": folder / "pan 1.tif"}
+    run_algorithm(home, "align", {**pair, "OUTPUT": target}, command=False)
     assert target.read_bytes() == (folder / "cli" / "a.tif").read_bytes()
     print("ok: the environment that “Install geodelreg” made aligns to the same bytes")
 

@@ -138,7 +138,13 @@ def commands(folder: Path) -> None:
         message = refusal(lambda: processing.run("geodelreg:align", target))
         assert "0.0.9" in message
         print(f"    {why}\n    {message}")
+        provider = registry.providerById("geodelreg")
+        old.write_text("#!/bin/sh\nprintf 'Commands:\\n  align  Correct\\n\\n'\n", encoding="utf-8")
+        provider.refreshAlgorithms()
+        able = {algorithm.name() for algorithm in provider.algorithms()}
+        assert able == {"align", "alignbands", "install"}, able
     finally:
         setting.value = ""
         old.unlink()
+        registry.providerById("geodelreg").refreshAlgorithms()
     say("no command, and an older one: told what to do")
