@@ -12,7 +12,7 @@ from pathlib import Path
 from qgis.core import (
     QgsApplication,
 )
-from results import align, bands_and_masks, batch_algorithm, batch_mode, looked_only, model
+from results import align, bands_and_masks, batch_algorithm, batch_mode, loaded, looked_only, model
 from stops import cancel, cancel_batch, commands, refusals
 
 
@@ -30,7 +30,7 @@ def main(folder: Path) -> None:
     plugin = Plugin(None)
     plugin.initProcessing()
     for step in (
-        *(align, looked_only, bands_and_masks, model, batch_mode, batch_algorithm),
+        *(align, looked_only, bands_and_masks, loaded, model, batch_mode, batch_algorithm),
         *(refusals, commands, cancel, cancel_batch),
     ):
         step(folder)

@@ -17,6 +17,7 @@ from qgis.core import (
     QgsProcessingModelParameter,
     QgsProcessingOutputHtml,
     QgsProcessingParameterRasterLayer,
+    QgsProject,
     QgsRasterLayer,
     QgsVectorLayer,
 )
@@ -220,3 +221,43 @@ def batch_algorithm(folder: Path) -> None:
     assert len(feedback.warnings) == 1
     assert Path(done["INDEX"]).exists()
     say(f"batch: {done['OUTCOME']}, footprints as a layer")
+
+
+def loaded(folder: Path) -> None:
+    """What the layer panel holds when QGIS loads the results."""
+    import processing
+
+    project = QgsProject.instance()
+    trees = []
+    for name, parameters in (
+        ("align", {**inputs(folder, 1), "OUTPUT": "TEMPORARY_OUTPUT", "MESH": "TEMPORARY_OUTPUT"}),
+        (
+            "alignbands",
+            {
+                "MS": [str(folder / f"band {number}.tif") for number in PAIRS],
+                "PAN": str(folder / "pan 1.tif"),
+                "OUTPUT": "TEMPORARY_OUTPUT",
+                "MESH": None,
+            },
+        ),
+    ):
+        target = {**parameters, "TIE_POINTS": "TEMPORARY_OUTPUT"}
+        processing.runAndLoadResults(f"geodelreg:{name}", target)
+        QgsApplication.processEvents()
+        (group,) = project.layerTreeRoot().children()
+        trees.append([child.name() for child in group.children()])
+        points = group.children()[0].layer()
+        assert points.renderer().symbol().symbolLayer(1).layerType() == "GeometryGenerator"
+        if name == "align":
+            flip = group.findGroup("After / before")
+            assert flip.isMutuallyExclusive()
+            assert [(n.name(), n.isVisible()) for n in flip.children()] == [
+                ("ms 1, aligned", True),
+                ("Before", False),
+            ]
+        project.clear()
+    assert trees == [
+        ["Tie points", "Mesh", "After / before"],
+        ["Tie points", *(f"band {number}, aligned" for number in reversed(PAIRS))],
+    ], trees
+    say("results come named, styled and grouped")
