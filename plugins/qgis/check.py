@@ -3,7 +3,7 @@
 Needs QGIS 3.22 or later with its Python (Debian: ``qgis`` and ``python3-qgis``), and geodelreg with
 its ``dev`` extra in the Python that runs this.  It packs the plugin, installs the zip into an empty
 profile, and compares what ``qgis_process`` writes with what the command line writes.  The rest is
-in ``in_qgis.py``.  With ``--install`` it also makes the environment as a user would, which fetches
+in ``in_qgis``.  With ``--install`` it also makes the environment as a user would, which fetches
 packages.  It takes some minutes.
 """
 
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,9 @@ def qgis_process(home: Path, *words: str, command: bool = True) -> subprocess.Co
     )
 
 
-def run_algorithm(home: Path, name: str, command: bool = True, **parameters: Any) -> str:
+def run_algorithm(
+    home: Path, name: str, parameters: Mapping[str, Path], command: bool = True
+) -> str:
     """Run an algorithm in ``qgis_process``; what it prints."""
     words = [f"{key}={value}" for key, value in parameters.items()]
     done = qgis_process(home, "run", f"geodelreg:{name}", "--", *words, command=command)
@@ -123,7 +126,7 @@ def same_bytes(home: Path, folder: Path) -> None:
             keys, words = {"OUTPUT": here[0]}, ["-o", there[0]]
         else:
             keys, words = {"REPORT": here[0]}, ["--json"]
-        run_algorithm(home, name, MS=ms, PAN=pan, **keys)
+        run_algorithm(home, name, {"MS": ms, "PAN": pan, **keys})
         printed = geodelreg(name, ms, pan, *words, answers=(0, 4))
         if name == "check":
             there[0].write_text(printed, encoding="utf-8")
@@ -145,15 +148,9 @@ def install(home: Path, folder: Path) -> None:
     assert "no geodelreg command" in failed.stdout + failed.stderr
     assert not target.exists()
     print("ok: without geodelreg, align says what to do")
-    print(run_algorithm(home, "install", command=False).strip().splitlines()[-1])
-    run_algorithm(
-        home,
-        "align",
-        command=False,
-        MS=folder / "ms 1.tif",
-        PAN=folder / "pan 1.tif",
-        OUTPUT=target,
-    )
+    print(run_algorithm(home, "install", {}, command=False).strip().splitlines()[-1])
+    pair = {"MS": folder / "ms 1.tif", "PAN": folder / "pan 1.tif"}
+    run_algorithm(home, "align", {**pair, "OUTPUT": target}, command=False)
     assert target.read_bytes() == (folder / "cli" / "a.tif").read_bytes()
     print("ok: the environment that “Install geodelreg” made aligns to the same bytes")
 
@@ -176,7 +173,7 @@ def main(arguments: list[str]) -> None:
         print(version)
         same_bytes(home, folder)
         # not where it lies: there, the plugin's sources would come before the unpacked zip
-        inside = shutil.copy(Path(__file__).with_name("in_qgis.py"), home)
+        inside = shutil.copytree(Path(__file__).with_name("in_qgis"), home / "in_qgis")
         subprocess.run([PYTHON, inside, str(folder)], env=environment(home, True), check=True)
         if "--install" in arguments:
             install(home, folder)

@@ -151,7 +151,8 @@ class _Aligning(GeodelregAlgorithm):
         self, rasters: dict[str, str], results: dict[str, Any], context: QgsProcessingContext
     ) -> None:
         """Have the results loaded with names and styles, in a group; rasters by file."""
-        group = ResultGroup(f"geodelreg: {self.ms_name}", self.rasters[0], self.ms_id)
+        before = self.rasters[0] if len(rasters) == 1 else ""
+        group = ResultGroup(f"geodelreg: {self.ms_name}", before, self.ms_id)
         for raster, name in rasters.items():
             group.load(context, raster, f"{name}, aligned")
         group.load(context, results[MESH], "Mesh", "mesh.qml")

@@ -76,7 +76,7 @@ class ResultGroup:
     ----------
     title : str
     before : str
-        File of the raster as it was.
+        File of the raster as it was; empty when there are several, which are not flipped.
     project_layer : str
         Id of its layer in the project, whose style the result gets; may be empty.
     """
@@ -105,7 +105,7 @@ class ResultGroup:
             if self._group is None:
                 self._group = root.insertGroup(0, self._title)
             parent = self._group
-            if isinstance(node.layer(), QgsRasterLayer):
+            if self._before and isinstance(node.layer(), QgsRasterLayer):
                 parent = self._before_and_after(project, node.layer())
             moved = node.clone()
             moved.setExpanded(False)

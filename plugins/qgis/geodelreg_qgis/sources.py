@@ -90,7 +90,7 @@ def file_of(source: Source) -> str:
     if source.filter:
         raise SourceError(
             f"{layer} shows a part of its file only (filter {source.filter}), and geodelreg would "
-            f"read all of it. Remove the filter, or save what you see. {_SAVE}"
+            "read all of it. Remove the filter, or export what is shown to a file and choose that."
         )
     if source.crs != source.file_crs:
         says = f"says {source.file_crs}" if source.file_crs else "states none"

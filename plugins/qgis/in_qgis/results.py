@@ -1,25 +1,15 @@
-"""The part of ``check.py`` that runs inside QGIS: models, batch mode, cancelling, refusals.
-
-``python3 in_qgis.py FOLDER``, where FOLDER holds three pairs; prints a line for each thing tried.
-"""
+"""Runs that end well: layers, models, batch mode."""
 
 from __future__ import annotations
 
-import os
+import json
 import shutil
-import sys
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+from helpers import PAIRS, Listening, inputs, say, square
 from qgis.core import (
     QgsApplication,
-    QgsCoordinateReferenceSystem,
     QgsProcessingContext,
-    QgsProcessingException,
-    QgsProcessingFeedback,
     QgsProcessingModelAlgorithm,
     QgsProcessingModelChildAlgorithm,
     QgsProcessingModelChildParameterSource,
@@ -31,51 +21,6 @@ from qgis.core import (
     QgsRasterLayer,
     QgsVectorLayer,
 )
-
-PAIRS = (1, 2, 3)
-CANCELLED_AFTER_S = (0.0, 0.3, 0.7, 1.1, 1.6, 2.2)
-
-
-class Listening(QgsProcessingFeedback):
-    """Feedback that keeps what it is told."""
-
-    def __init__(self) -> None:
-        super().__init__(False)
-        self.warnings: list[str] = []
-        self.steps: list[float] = []
-        self.progressChanged.connect(self.steps.append)
-
-    def pushWarning(self, warning: str) -> None:
-        """Keep a warning."""
-        self.warnings.append(warning)
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder but GDAL's statistics, with its content."""
-    return {
-        str(path): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and not path.name.endswith(".aux.xml")
-    }
-
-
-def say(what: str) -> None:
-    """Report one thing that works."""
-    print(f"ok: {what}", flush=True)
-
-
-def refusal(run: Callable[[], Any]) -> str:
-    """Message of a run that must fail."""
-    try:
-        run()
-    except QgsProcessingException as error:
-        return str(error)
-    raise AssertionError("it was not refused")
-
-
-def inputs(folder: Path, number: int) -> dict[str, str]:
-    """Parameters for one pair."""
-    return {"MS": str(folder / f"ms {number}.tif"), "PAN": str(folder / f"pan {number}.tif")}
 
 
 def align(folder: Path) -> None:
@@ -125,13 +70,6 @@ def align(folder: Path) -> None:
     say("align: three band files, one correction")
 
 
-def style(name: str) -> str:
-    """File of one of the plugin's styles."""
-    import geodelreg_qgis
-
-    return str(Path(geodelreg_qgis.__file__).parent / "styles" / name)
-
-
 def looked_only(folder: Path) -> None:
     """No output raster: a dry run."""
     import processing
@@ -142,6 +80,37 @@ def looked_only(folder: Path) -> None:
     assert done["OUTPUT"] is None
     assert done["OUTCOME"] == "aligned"
     say("align without an output: found and reported only")
+
+
+def bands_and_masks(folder: Path) -> None:
+    """MS as several layers, a raster mask with values, a vector mask."""
+    import processing
+
+    mask, report = square(folder), folder / "masks.json"
+    done = processing.run(
+        "geodelreg:check",
+        {
+            "MS": str(folder / "band 1.tif"),
+            "MORE": [str(folder / f"band {number}.tif") for number in PAIRS[1:]],
+            "PAN": str(folder / "pan 1.tif"),
+            "MASK": [str(mask)],
+            "PAN_MASK": [str(mask)],
+            "REPORT": str(report),
+        },
+    )
+    found = json.loads(report.read_text(encoding="utf-8"))
+    assert done["OUTCOME"] == "misaligned"
+    assert len(found["inputs"]["source"]["files"]) == len(PAIRS)
+    assert [use["image"] for use in found["masks"]] == ["source", "reference"]
+    assert {use["kind"] for use in found["masks"]} == {"vector"}
+    say(f"check of three band files with two masks: {done['DISTANCE_PX']:.3f} px off")
+
+
+def style(name: str) -> str:
+    """File of one of the plugin's styles."""
+    import geodelreg_qgis
+
+    return str(Path(geodelreg_qgis.__file__).parent / "styles" / name)
 
 
 def model(folder: Path) -> None:
@@ -254,144 +223,41 @@ def batch_algorithm(folder: Path) -> None:
     say(f"batch: {done['OUTCOME']}, footprints as a layer")
 
 
-def cancel(folder: Path) -> None:
-    """Cancel at six moments, in the same thread as QGIS runs algorithms in scripts."""
+def loaded(folder: Path) -> None:
+    """What the layer panel holds when QGIS loads the results."""
     import processing
 
-    slowest = 0.0
-    for name in ("align", "pansharpen"):
-        for wait in CANCELLED_AFTER_S:
-            before, feedback = files(folder), Listening()
-            asked: list[float] = []
-
-            def ask(feedback: Listening = feedback, asked: list[float] = asked) -> None:
-                asked.append(time.monotonic())
-                feedback.cancel()
-
-            timer = threading.Timer(wait, ask)
-            timer.start()
-            target = {**inputs(folder, 2), "OUTPUT": str(folder / "cancelled.tif")}
-            message = refusal(
-                lambda name=name, target=target, feedback=feedback: processing.run(
-                    f"geodelreg:{name}", target, feedback=feedback
-                )
-            )
-            slowest = max(slowest, time.monotonic() - asked[0])
-            assert "Cancelled" in message, message
-            assert files(folder) == before
-            assert not [path for path in folder.rglob("*") if "geodelreg" in path.name]
-    assert slowest < 2
-    say(
-        f"cancelled at {2 * len(CANCELLED_AFTER_S)} moments: over within {slowest:.2f} s, no debris"
-    )
-
-
-def cancel_batch(folder: Path) -> None:
-    """Cancel a batch when its first pair is done, and let it go on."""
-    import processing
-
-    (folder / "again").mkdir()
-    target = {
-        "PAIR_MS": str(folder / "ms {n}.tif"),
-        "PAIR_PAN": str(folder / "pan {n}.tif"),
-        "OUTPUT": "{n}.tif",
-        "OUT_ROOT": str(folder / "again"),
-        "WORKERS": 1,
-        "TABLE": str(folder / "again.csv"),
-    }
-    feedback = Listening()
-    feedback.progressChanged.connect(lambda percent: feedback.cancel())
-    message = refusal(lambda: processing.run("geodelreg:batch", target, feedback=feedback))
-    assert "The pairs that are done stay" in message, message
-    done = len(list((folder / "again").glob("*.tif")))
-    assert 1 <= done < len(PAIRS)
-    assert not [path for path in (folder / "again").iterdir() if path.name.startswith(".")]
-    processing.run("geodelreg:batch", {**target, "RESUME": True})
-    assert len(list((folder / "again").glob("*.tif"))) == len(PAIRS)
-    say(f"a batch cancelled after {done} of {len(PAIRS)} pairs goes on")
-
-
-def refusals(folder: Path) -> None:
-    """Layers that are no files, and images that do not support an alignment."""
-    import processing
-
-    before = files(folder)
-    pair, project = inputs(folder, 1), QgsProject.instance()
-
-    def tried(**changed: Any) -> str:
-        target = {**pair, "OUTPUT": str(folder / "refused.tif"), "TIE_POINTS": None, **changed}
-        return refusal(lambda: processing.run("geodelreg:align", target))
-
-    web = QgsRasterLayer("type=xyz&url=https://tile.invalid/{z}/{x}/{y}.png", "Web map", "wms")
-    other = QgsRasterLayer(inputs(folder, 3)["MS"], "Assigned")
-    other.setCrs(QgsCoordinateReferenceSystem("EPSG:32633"))
-    memory = QgsVectorLayer("Polygon?crs=EPSG:32618", "Clouds", "memory")
-    project.addMapLayers([web, other, memory])
-    for message, expected in (
-        (tried(MS=web), "web map"),
-        (tried(MS=other), "in QGIS only"),
-        (tried(MASK=[memory]), "kept in memory"),
-        (tried(MS=str(folder / "noise.tif")), "Refused: "),
-        (tried(PAN=pair["MS"]), "as MS and as PAN"),
-        (tried(OUTPUT=pair["MS"]), "ms 1.tif"),
-        (tried(OUTPUT=str(folder / "no" / "folder.tif")), "folder"),
+    project = QgsProject.instance()
+    trees = []
+    for name, parameters in (
+        ("align", {**inputs(folder, 1), "OUTPUT": "TEMPORARY_OUTPUT", "MESH": "TEMPORARY_OUTPUT"}),
+        (
+            "alignbands",
+            {
+                "MS": [str(folder / f"band {number}.tif") for number in PAIRS],
+                "PAN": str(folder / "pan 1.tif"),
+                "OUTPUT": "TEMPORARY_OUTPUT",
+                "MESH": None,
+            },
+        ),
     ):
-        assert expected in message, message
-        print(f"    {message.splitlines()[-1]}")
-    project.removeAllMapLayers()
-    assert files(folder) == before
-    say("refused in plain words, nothing written")
-
-
-def commands(folder: Path) -> None:
-    """No command, and an older one."""
-    import processing
-    from processing.core.ProcessingConfig import ProcessingConfig
-
-    from geodelreg_qgis.base import COMMAND_SETTING
-
-    registry = QgsApplication.processingRegistry()
-    old = folder / "old geodelreg"
-    old.write_text("#!/bin/sh\necho geodelreg 0.0.9\n", encoding="utf-8")
-    old.chmod(0o755)
-    setting = ProcessingConfig.settings[COMMAND_SETTING]
-    try:
-        setting.value = str(folder / "nowhere")
-        able, why = registry.createAlgorithmById("geodelreg:align").canExecute()
-        assert not able
-        assert "no geodelreg command" in why
-        assert "Install geodelreg" in why
-        setting.value = str(old)
-        target = {**inputs(folder, 1), "OUTPUT": str(folder / "old.tif")}
-        message = refusal(lambda: processing.run("geodelreg:align", target))
-        assert "0.0.9" in message
-        print(f"    {why}\n    {message}")
-    finally:
-        setting.value = ""
-        old.unlink()
-    say("no command, and an older one: told what to do")
-
-
-def main(folder: Path) -> None:
-    """Try everything in a QGIS without windows."""
-    application = QgsApplication([], True)
-    application.initQgis()
-    import processing
-    from processing.core.Processing import Processing
-
-    Processing.initialize()
-    from geodelreg_qgis.plugin import Plugin
-
-    assert processing
-    plugin = Plugin(None)
-    plugin.initProcessing()
-    looking, stopping = (align, looked_only, refusals, commands), (cancel, cancel_batch)
-    for step in (*looking, *stopping, model, batch_mode, batch_algorithm):
-        step(folder)
-    plugin.unload()
-    sys.stdout.flush()
-    os._exit(0)  # QGIS 3.22 may crash while Python takes it down
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+        target = {**parameters, "TIE_POINTS": "TEMPORARY_OUTPUT"}
+        processing.runAndLoadResults(f"geodelreg:{name}", target)
+        QgsApplication.processEvents()
+        (group,) = project.layerTreeRoot().children()
+        trees.append([child.name() for child in group.children()])
+        points = group.children()[0].layer()
+        assert points.renderer().symbol().symbolLayer(1).layerType() == "GeometryGenerator"
+        if name == "align":
+            flip = group.findGroup("After / before")
+            assert flip.isMutuallyExclusive()
+            assert [(n.name(), n.isVisible()) for n in flip.children()] == [
+                ("ms 1, aligned", True),
+                ("Before", False),
+            ]
+        project.clear()
+    assert trees == [
+        ["Tie points", "Mesh", "After / before"],
+        ["Tie points", *(f"band {number}, aligned" for number in reversed(PAIRS))],
+    ], trees
+    say("results come named, styled and grouped")
