@@ -7,6 +7,7 @@ from pathlib import Path
 
 from geodelreg.product.atomic import write_text_atomically
 from geodelreg.product.report import report_json
+from geodelreg.product.targets import STDOUT
 from geodelreg.report.html import check_jinja
 from geodelreg.values.result import Alignment
 
@@ -30,7 +31,7 @@ def check_report(path: Path) -> None:
 
 
 def report_text(alignment: Alignment, path: Path) -> str:
-    """Text of a report: a page for ``.html``, else JSON with every tie point.
+    """Text of a report: a page for ``.html``, else JSON; in a file with every tie point.
 
     Raises
     ------
@@ -40,7 +41,8 @@ def report_text(alignment: Alignment, path: Path) -> str:
     """
     check_report(path)
     if not is_page(path):
-        return report_json(alignment, tie_points=True) + "\n"
+        listed = path != STDOUT and len(alignment.tie_points) > 0
+        return report_json(alignment, tie_points=listed) + "\n"
     from geodelreg.report.page import page
 
     return page(alignment)
@@ -55,7 +57,7 @@ def write_report(alignment: Alignment, path: str | PathLike[str], overwrite: boo
         As returned by `align`, or held by `AlignmentRefusedError`.
     path : path
         ``.html`` for a page to look at, which reads the rasters again (needs the report extra);
-        else JSON with every tie point.  ``-`` is standard output.
+        else JSON with every tie point.  ``-`` is standard output: JSON without them.
     overwrite : bool
 
     Raises

@@ -118,6 +118,7 @@ _WORST = 2.0
 _WORTH_A_WORD = 0.05
 """Of the patches that matched: fewer lie elsewhere in any good pair."""
 _WORTH_A_WORD_SILENT = 0.3
+_MOSTLY = 0.75
 _TOGETHER = 0.4
 """Spread over length of displacements that are one motion."""
 
@@ -228,7 +229,7 @@ def _elsewhere(alignment: Alignment) -> str:
     length = float(np.median(np.hypot(*off.T)))
     return (
         f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere: "
-        f"{_region(alignment, some, away)} of the picture, {short(length)} PAN px off in the "
+        f"{_region(alignment, some, away)}, {short(length)} PAN px off in the "
         f"median, {_pattern(points, away, length)}."
     )
 
@@ -254,15 +255,30 @@ def _silent(alignment: Alignment) -> str:
         return ""
     return (
         f"{int(silent.sum())} of {len(status)} patches showed nothing to match, as clouds or "
-        f"water do, or were left out: {_region(alignment, every, silent)} of the picture."
+        f"water do, or were left out: {_region(alignment, every, silent)}."
     )
 
 
 def _region(alignment: Alignment, some: BoolArray, member: BoolArray) -> str:
     """Where some of the patches lie, in words."""
     height, width = alignment.source.grid.shape
-    xy = alignment.tie_points.source_px[some]
-    return region(xy, member[some], (float(width), float(height)))
+    xy = alignment.tie_points.source_px
+    sharp = region(xy[some], member[some], (float(width), float(height)))
+    if sharp.startswith("the "):
+        return f"{sharp} of the picture"
+    x, y = (xy[member] / (width, height)).T
+    words = [_half(y, "upper", "lower"), _half(x, "left", "right")]
+    where = " ".join(dict.fromkeys(word for word in words if word))
+    if where in ("upper", "lower", "left", "right"):
+        where += " half"
+    return f"mostly in the {where} of the picture" if where else "all over the picture"
+
+
+def _half(share: FloatArray, low: str, high: str) -> str:
+    """Which half of an axis, of its length, most places lie in; empty of none."""
+    halves = {low: share < 0.5, high: share > 0.5, "middle": np.abs(share - 0.5) < 0.25}
+    best = max(halves, key=lambda name: halves[name].mean())
+    return best if halves[best].mean() >= _MOSTLY else ""
 
 
 def direction(residual_px: Sequence[float] | FloatArray) -> str:

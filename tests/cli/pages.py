@@ -70,3 +70,10 @@ def picture(uri: str) -> NDArray[Any]:
     image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     return image.astype(np.float64)
+
+
+def likeness(image: NDArray[Any], wanted: NDArray[Any]) -> float:
+    """Correlation of ranks of two pictures: 1 where one is a stretched form of the other."""
+    seen = np.isfinite(wanted)
+    ranks = [np.argsort(np.argsort(one[seen], kind="stable")) for one in (image, wanted)]
+    return float(np.corrcoef(ranks)[0, 1])

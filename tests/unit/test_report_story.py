@@ -1,0 +1,186 @@
+"""What a page says in words, and which places it shows, of pairs whose fault is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from affine import Affine
+from numpy.typing import NDArray
+
+from geodelreg.options import AlignOptions
+from geodelreg.report.frame import frame_of
+from geodelreg.report.places import places
+from geodelreg.report.residuals import error_map
+from geodelreg.report.words import bar, command, story
+from geodelreg.values.points import Status, TiePoints
+from geodelreg.values.raster import Grid
+from geodelreg.values.result import Alignment, Outcome, Reason, Verdict
+from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, SHIFTED, UTM16, alignment
+
+SIDE = 12
+"""Patches along an axis of MS, 100 × 80 pixels."""
+REFUSED = Verdict(Outcome.REFUSED, (Reason("rival_motion", 0.9, 0.67, False, "0.9 patches"),))
+
+
+def patches(
+    residual: NDArray[np.float64], away: NDArray[np.bool_], silent: NDArray[np.bool_] | None = None
+) -> TiePoints:
+    """A lattice of patches with (N, 2) residuals in PAN pixels; some lie elsewhere."""
+    x, y = np.meshgrid(np.linspace(4, 96, SIDE), np.linspace(4, 76, SIDE))
+    source = np.stack([x.ravel(), y.ravel()], axis=1)
+    there = np.array([~PAN_HEADER @ (SHIFTED @ tuple(xy)) for xy in source])
+    status = np.where(away, Status.CONSENSUS, Status.KEPT).astype(np.uint8)
+    if silent is not None:
+        status[silent] = Status.TEXTURE
+        residual = np.where(silent[:, None], np.nan, residual)
+    return TiePoints(
+        source_px=source,
+        reference_px=there - residual if silent is None else there,
+        covariance_px2=np.tile(np.diag([1e-4, 1e-4]), (len(source), 1, 1)),
+        score=np.full(len(source), 0.9),
+        status=status,
+        residual_px=residual,
+    )
+
+
+def lattice() -> NDArray[np.float64]:
+    x, y = np.meshgrid(np.linspace(0, 1, SIDE), np.linspace(0, 1, SIDE))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def noise(scale: float) -> NDArray[np.float64]:
+    return np.random.default_rng(3).normal(0, scale, (SIDE * SIDE, 2))
+
+
+def torn() -> Alignment:
+    lower = lattice()[:, 1] > 0.7
+    residual = noise(0.02) + np.where(lower[:, None], [5.0, -3.0], [0.0, 0.0])
+    return alignment(tie_points=patches(residual, lower), verdict=REFUSED)
+
+
+def bent() -> Alignment:
+    x, y = lattice().T
+    residual = noise(0.02) + np.stack([2 * np.sin(3 * y), 2 * np.cos(3 * x) * y], axis=1)
+    return alignment(tie_points=patches(residual, y > 0.4), verdict=REFUSED)
+
+
+def cloudy() -> Alignment:
+    x, y = lattice().T
+    cloud = (x < 0.68) & (y < 0.68)
+    silent = cloud & (np.arange(SIDE * SIDE) % 4 > 0)
+    residual = noise(0.02) + np.where(cloud[:, None], noise(2.0), 0.0)
+    return alignment(tie_points=patches(residual, cloud, silent))
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [
+        (
+            torn(),
+            ("the lower 33 %", "all alike (5.0", "right and 3.0", "up), as if that part were torn"),
+        ),
+        (bent(), ("in directions that change gradually, as if the picture were bent",)),
+        (
+            cloudy(),
+            ("patches showed nothing to match, as clouds or water do", "in the upper left of",
+             "each in its own direction, as clouds"),
+        ),
+    ],
+    ids=["torn", "bent", "cloudy"],
+)  # fmt: skip
+def test_the_story_says_what_is_wrong_and_where(made: Alignment, told: tuple[str, ...]) -> None:
+    text = " ".join(story(made))
+    for words in told:
+        assert words in text
+
+
+def test_the_story_of_a_good_pair_alarms_nobody() -> None:
+    good = alignment(tie_points=patches(noise(0.02), np.zeros(SIDE * SIDE, dtype=bool)))
+    text = " ".join(story(good))
+    assert "MS lay" in text
+    for alarming in ("elsewhere", "torn", "bent", "nothing to match"):
+        assert alarming not in text
+
+
+def test_the_worst_place_lies_where_the_fault_is_and_the_best_does_not() -> None:
+    made = torn()
+    found = {place.name: place for place in places(made.tie_points, frame_of(made))}
+    assert list(found) == ["worst", "typical", "best"]
+    assert found["worst"].residual_px == pytest.approx((5.0, -3.0), abs=0.1)
+    assert "lower" in found["worst"].where
+    for name in ("typical", "best"):
+        assert found[name].distance_px < 0.1
+        assert "lower" not in found[name].where
+    assert found["best"].distance_px <= found["typical"].distance_px
+    window = frame_of(made).window
+    for place in found.values():
+        column, row, width, height = place.window
+        assert window.column <= column
+        assert column + width <= window.column + window.width
+        assert window.row <= row
+        assert row + height <= window.row + window.height
+
+
+def test_the_map_of_what_is_left_is_large_where_the_fault_is() -> None:
+    made = torn()
+    values = error_map(made.tie_points, frame_of(made))
+    upper, lower = values[: len(values) // 2], values[-len(values) // 8 :]
+    assert np.nanmax(upper) < 0.2
+    assert np.nanmin(lower) > 5.0
+    # three gross mismatches among good neighbours are nobody's fault
+    residual = noise(0.02)
+    residual[[14, 70, 120]] += 30.0
+    away = np.zeros(SIDE * SIDE, dtype=bool)
+    away[[14, 70, 120]] = True
+    made = alignment(tie_points=patches(residual, away))
+    assert np.nanmax(error_map(made.tie_points, frame_of(made))) < 0.2
+
+
+def test_without_points_the_middle_is_shown() -> None:
+    points = patches(noise(0.1), np.zeros(SIDE * SIDE, dtype=bool), np.ones(SIDE * SIDE, bool))
+    made = alignment(tie_points=points)
+    (place,) = places(made.tie_points, frame_of(made))
+    assert place.name == "middle"
+    assert place.where == "middle"
+
+
+def test_ms_that_lies_nowhere_on_pan_shows_all_of_pan() -> None:
+    far = Affine.translation(1e6, 0) @ MS_HEADER
+    made = alignment(source=Grid(far, (80, 100), UTM16), corrected=far)
+    assert frame_of(made).window == (0, 0, 400, 320)
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "passed", "name", "used"),
+    [
+        (0.35, 0.7, True, "sigma_px", 0.5),
+        (1.4, 0.7, False, "sigma_px", 2.0),
+        (16.0, 8.0, True, "tie_points", 0.5),
+        (4.0, 8.0, False, "tie_points", 2.0),
+        (-200.0, -2.0, True, "log_nfa", 0.01),
+        (-1.0, -2.0, False, "log_nfa", 2.0),
+        (3.0, -2.0, False, "log_nfa", 2.0),
+        (0.0, 0.5, True, "local", 0.0),
+        (float("nan"), 0.5, False, "local", 2.0),
+        (float("nan"), 0.5, True, "local", 0.0),
+    ],
+)
+def test_a_bar_is_beyond_the_limit_when_its_reason_failed(
+    value: float, limit: float, passed: bool, name: str, used: float
+) -> None:
+    found = bar(Reason(name, value, limit, passed, ""))
+    assert found.used == pytest.approx(used)
+    assert (found.used <= 1.0) is passed
+
+
+def test_the_command_has_every_option_that_was_changed() -> None:
+    asked: dict[str, Any] = {
+        "model": "shift", "masks": ("my clouds.tif", "b.tif=3"), "threads": 3, "max_shift_px": 9.5,
+    }  # fmt: skip
+    told = command(alignment(options=AlignOptions(**asked)))
+    assert told == (
+        "geodelreg align scene/ms.tif scene/pan.tif --dry-run --report again.html --model shift "
+        "--mask 'my clouds.tif' --mask b.tif=3 --max-shift 9.5"
+    )
