@@ -20,6 +20,7 @@ COMMANDS = {
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
+    "wald": ("benchmarks.sharpening.wald", "what alignment is worth to pansharpening"),
     "batch": ("benchmarks.batch.run", "many pairs: throughput, Dask, kills, a huge manifest"),
     "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),
     "fuzz": (
