@@ -22,6 +22,7 @@ COMMANDS = {
     "speed": ("benchmarks.peers.speed", "wall time beside a half-size SIFT script, in turn"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
+    "wald": ("benchmarks.sharpening.wald", "what alignment is worth to pansharpening"),
     "batch": ("benchmarks.batch.run", "many pairs: throughput, Dask, kills, a huge manifest"),
     "browser": ("benchmarks.browser.run", "the pages of reports in headless Chromium"),
     "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),

@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -40,7 +41,8 @@ from geodelreg.product.warp import Validity, warped_onto
 from geodelreg.values.raster import Float32Array, Grid
 
 _BLOCK_PX = 512
-_STRIP_ROWS = 512
+_TILE_PX = 1024
+"""Read together: a few blocks, all bands of which stay in GDAL's cache until all are read."""
 _SAMPLE_SIDE = 300
 """Of the decimated images that the weights are fitted on: 90 000 pixels determine a few numbers."""
 
@@ -289,8 +291,10 @@ def _write_tiff(
         with rasterio.open(draft, "w", **profile) as dataset:
             dataset.descriptions = names
             dataset.update_tags(**tags)
-            for top in range(0, height, _STRIP_ROWS):
-                window = Window(0, top, width, min(_STRIP_ROWS, height - top))
+            corners = list(product(range(0, height, _TILE_PX), range(0, width, _TILE_PX)))
+            for number, (top, left) in enumerate(corners, start=1):
+                size = min(_TILE_PX, width - left), min(_TILE_PX, height - top)
+                window = Window(left, top, *size)
                 data = sharp.read(window=window)
                 cover = [file.read_masks(band, window=window) > 0 for file, band in covers]
                 valid = np.logical_and.reduce(cover)
@@ -300,7 +304,7 @@ def _write_tiff(
                     dataset.write_mask(valid, window=window)
                 dataset.write(data, window=window)
                 if progress is not None:
-                    progress(min(1.0, (top + _STRIP_ROWS) / height), "sharpening")
+                    progress(number / len(corners), "sharpening")
 
 
 def _declared_nodata(what: Sharpening, sharp: Any) -> float | None:
