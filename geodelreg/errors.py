@@ -132,6 +132,18 @@ class ReportError(GeodelregError):
     """The JSON report is none, is of another version, or tells of other rasters."""
 
 
+class CorrectionFileError(GeodelregError):
+    """A file is not the report of an accepted alignment, is broken, or of another version."""
+
+
+class CorrectionMisfitError(GeodelregError):
+    """A file does not lie where the correction that is applied to it was found."""
+
+
+class VectorUnreadableError(GeodelregError):
+    """A vector file whose coordinates are to be corrected cannot be read."""
+
+
 class MissingExtraError(GeodelregError):
     """An optional dependency is not installed."""
 
