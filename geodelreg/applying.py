@@ -49,8 +49,8 @@ def apply(
 
     Raises
     ------
-    CorrectionFileError
-        `correction` is broken or of another kind.
+    ReportError
+        `correction` is broken, of another kind, or of a refusal.
     CorrectionMisfitError
         `source` lies elsewhere.
     UsageError

@@ -129,11 +129,7 @@ class GcpFormatError(GeodelregError):
 
 
 class ReportError(GeodelregError):
-    """The JSON report is none, is of another version, or tells of other rasters."""
-
-
-class CorrectionFileError(GeodelregError):
-    """A file is not the report of an accepted alignment, is broken, or of another version."""
+    """The JSON report is none, is of another version, of a refusal, or tells of other rasters."""
 
 
 class CorrectionMisfitError(GeodelregError):

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from affine import Affine
 
-from geodelreg.errors import CorrectionFileError, CorrectionMisfitError
+from geodelreg.errors import CorrectionMisfitError, ReportError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.grid import outline
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.header import header_map
-from geodelreg.geo.maps.parsing import map_of_json
 from geodelreg.geo.maps.smooth import Inverse
+from geodelreg.product.reading import read_report
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Correction
 from geodelreg.version import __version__
 
-_VERSION = "1."
-"""Of report schemas that are understood."""
-_MOST_BYTES = 50_000_000
 _AFFINE_ENOUGH_PX = 1e-3
 """Between a header and the same correction in another CRS."""
 _EDGE_PLACES = 16
@@ -140,57 +135,23 @@ def read_correction(path: Path) -> StoredCorrection:
 
     Raises
     ------
-    CorrectionFileError
+    ReportError
         It is none, of another version, broken, or of an alignment that was refused.
     """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError("it is larger than any report")
-        said = json.loads(path.read_text(encoding="utf-8"))
-        version = str(said["schema_version"])
-        if not version.startswith(_VERSION):
-            raise CorrectionFileError(
-                f"{path} is a report of schema {version}, which this version does not read",
-                f"Align again with this version ({__version__}), or apply it with the one that "
-                "wrote it.",
-            )
-        if not said["verdict"]["accepted"]:
-            raise CorrectionFileError(
-                f"{path} is the report of an alignment that was refused: it corrects nothing",
-                "Align again, see why it was refused in verdict.reasons.",
-            )
-        return _stored(path, said)
-    except FileNotFoundError as error:
-        raise CorrectionFileError(f"{path} does not exist", "Check the path.") from error
-    except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise CorrectionFileError(
-            f"{path} is not the report of an alignment ({reason})",
-            "Give what geodelreg align --report has written.",
-        ) from error
-
-
-def _stored(path: Path, said: Mapping[str, Any]) -> StoredCorrection:
-    source, reference = (_grid(said["inputs"][role]) for role in ("source", "reference"))
-    correction = said["correction"]
-    if correction.get("pixel_map") is not None:
-        placement: PixelMap = map_of_json(correction["pixel_map"])
-    else:
-        corrected = Affine.from_gdal(*map(float, correction["corrected_geotransform"]))
-        placement = AffineMap(~source.transform @ corrected)
-    centre = np.array([source.shape[::-1]]) / 2.0
-    if not np.isfinite(placement.forward(centre)).all():
-        raise ValueError("its numbers are not finite")
+    alignment = read_report(path)
+    if not alignment.verdict.accepted:
+        raise ReportError(
+            f"{path} is the report of an alignment that was refused: it corrects nothing",
+            "Align again, see why it was refused in verdict.reasons.",
+        )
+    source, correction = alignment.source.grid, alignment.correction
+    placement = alignment.solution.map
+    if alignment.fits_a_header:
+        placement = AffineMap(~source.transform @ correction.corrected)
     tags = {
         "GEODELREG_APPLIED": path.name,
-        "GEODELREG_MODEL": str(correction["model"]),
+        "GEODELREG_MODEL": correction.model,
         "GEODELREG_VERSION": __version__,
     }
-    return StoredCorrection(path, source, reference, str(correction["model"]), placement, tags)
-
-
-def _grid(said: Mapping[str, Any]) -> Grid:
-    transform = Affine.from_gdal(*map(float, said["geotransform"]))
-    if transform.is_degenerate:
-        raise ValueError("its geotransform squeezes the raster to a line")
-    return Grid(transform, (int(said["height"]), int(said["width"])), str(said["crs_wkt"]))
+    reference = alignment.reference.grid
+    return StoredCorrection(path, source, reference, correction.model, placement, tags)

@@ -17,7 +17,7 @@ from pyproj import Transformer
 
 import geodelreg
 from geodelreg import Alignment, AlignOptions, WriteOptions
-from geodelreg.errors import CorrectionFileError, CorrectionMisfitError, UsageError
+from geodelreg.errors import CorrectionMisfitError, ReportError, UsageError
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap, Kernel
 from geodelreg.product.report import report_json
@@ -238,18 +238,19 @@ def test_files_of_another_place_are_refused_unless_forced(scene: tuple[Path, Pat
         assert file.with_name(out).exists()
 
 
+def refused_one(said: Any) -> Any:
+    return said | {"verdict": {"outcome": "refused", "accepted": False, "reasons": []}}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda said: said | {"schema_version": "9.0"}, "schema 9.0"),
-        (lambda said: said | {"verdict": {"accepted": False}}, "was refused"),
-        (lambda said: {"type": "FeatureCollection"}, "not the report"),
-        (lambda said: [], "not the report"),
-        (
-            lambda said: said | {"correction": {"model": "field", "pixel_map": {"kind": "tps"}}},
-            "tps",
-        ),
-        (lambda said: said | {"inputs": {}}, "not the report"),
+        (lambda said: said | {"schema_version": "9.0"}, "of 9.0"),
+        (refused_one, "was refused"),
+        (lambda said: {"type": "FeatureCollection"}, "no report"),
+        (lambda said: [], "no report"),
+        (lambda said: said | {"found": {"model": "field", "pixel_map": {"kind": "tps"}}}, "wrong"),
+        (lambda said: said | {"inputs": {}}, "wrong"),
     ],
 )
 def test_broken_and_foreign_corrections_are_refused(
@@ -257,7 +258,7 @@ def test_broken_and_foreign_corrections_are_refused(
 ) -> None:
     _, report = stored(scene, "affine")
     report.write_text(json.dumps(change(json.loads(report.read_text("utf-8")))))
-    with pytest.raises(CorrectionFileError, match=words) as refused:
+    with pytest.raises(ReportError, match=words) as refused:
         geodelreg.apply(report, scene[0], scene[0].with_name("out.tif"))
     assert report.name in refused.value.cause
     assert refused.value.remedy

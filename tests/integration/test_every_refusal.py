@@ -32,9 +32,8 @@ from geodelreg.product.gcps import read_gcps
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.reading import read_report
-from geodelreg.product.stored import StoredCorrection, read_correction
+from geodelreg.product.stored import StoredCorrection
 from geodelreg.product.vectors import write_vector
-from geodelreg.values.raster import Grid
 from tests.integration.raster_samples import GCPS, TAGS, UTM18, correction_of, make_cog
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -178,9 +177,6 @@ CASES = {
     errors.FileLockedError: Case(locked, ("out.txt",)),
     errors.GcpFormatError: Case(
         lambda folder: read_gcps(text_file(folder, "gcps.points")), ("gcps.points",)
-    ),
-    errors.CorrectionFileError: Case(
-        lambda folder: read_correction(text_file(folder, "report.json")), ("report.json",)
     ),
     errors.CorrectionMisfitError: Case(
         lambda folder: stored(folder).check_share("mask.tif", 0.1), ("mask.tif", "report.json")
