@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,12 @@ from pyproj import Transformer
 
 import geodelreg
 from geodelreg import Alignment, AlignOptions, WriteOptions
-from geodelreg.errors import CorrectionMisfitError, ReportError, UsageError
+from geodelreg.errors import (
+    CorrectionMisfitError,
+    LossyOutputError,
+    ReportError,
+    UsageError,
+)
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap, Kernel
 from geodelreg.product.report import report_json
@@ -142,6 +148,37 @@ def test_a_raster_in_another_crs_is_moved_on_the_same_ground(scene: tuple[Path, 
     with rasterio.open(mask.with_name("out.tif")) as out:
         got = np.stack(out.transform @ (at[:, 0], at[:, 1]), axis=1)
     np.testing.assert_allclose(got, expected, rtol=0, atol=0.01)
+
+
+def test_control_points_carry_a_field_for_gdals_thin_plate_spline(
+    scene: tuple[Path, Path],
+) -> None:
+    alignment, _ = stored(scene, "field")
+    out = scene[0].with_name("gcps.tif")
+    geodelreg.write(alignment, out, WriteOptions(georef="gcps"))
+    with rasterio.open(out) as dataset:
+        points, _ = dataset.gcps
+    at = np.random.default_rng(0).uniform(0, SIDE, (300, 2))
+    header = np.stack(HEADER @ (at[:, 0], at[:, 1]), axis=1)
+    expected = true_ground(alignment, header)
+    with rasterio.transform.GCPTransformer(points, tps=True) as spline:
+        got = np.stack(spline.xy(at[:, 1], at[:, 0], offset="ul"), axis=1)
+        rows, columns = spline.rowcol(*expected.T, op=np.positive)
+    assert np.hypot(*(got - expected).T).max() < 0.02 * 4.0
+    assert np.hypot(columns - at[:, 0], rows - at[:, 1]).max() < 0.02
+
+
+def test_a_jump_is_no_thin_plate_spline(scene: tuple[Path, Path]) -> None:
+    alignment, _ = stored(scene, "field")
+    smooth = alignment.solution.map
+    assert isinstance(smooth, FieldMap)
+    target = smooth.target + np.where(smooth.source[:, 1:] > 30, [[0.8, 0.6]], 0.0)
+    torn = replace(smooth, target=target, jumps=(30.0,))
+    alignment = replace(alignment, solution=replace(alignment.solution, map=torn))
+    with pytest.raises(LossyOutputError, match="thin plate spline") as refused:
+        geodelreg.write(alignment, scene[0].with_name("out.tif"), WriteOptions(georef="gcps"))
+    assert "--warp" in refused.value.remedy
+    assert not scene[0].with_name("out.tif").exists()
 
 
 def test_a_field_needs_warp(scene: tuple[Path, Path]) -> None:
