@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from geodelreg import errors
     from geodelreg.alignment import Alignment
     from geodelreg.api import align, check
+    from geodelreg.applying import apply
     from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
     from geodelreg.report.output import write_report
@@ -31,6 +32,7 @@ __all__ = [
     "WriteOptions",
     "__version__",
     "align",
+    "apply",
     "check",
     "errors",
     "export_gcps",
@@ -49,6 +51,7 @@ _HOMES = {
     "PansharpenOptions": "geodelreg.options",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
+    "apply": "geodelreg.applying",
     "check": "geodelreg.api",
     "export_gcps": "geodelreg.writing",
     "pansharpen": "geodelreg.sharpen",

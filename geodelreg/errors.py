@@ -129,7 +129,15 @@ class GcpFormatError(GeodelregError):
 
 
 class ReportError(GeodelregError):
-    """The JSON report is none, is of another version, or tells of other rasters."""
+    """The JSON report is none, is of another version, of a refusal, or tells of other rasters."""
+
+
+class CorrectionMisfitError(GeodelregError):
+    """A file does not lie where the correction that is applied to it was found."""
+
+
+class VectorUnreadableError(GeodelregError):
+    """A vector file whose coordinates are to be corrected cannot be read."""
 
 
 class MissingExtraError(GeodelregError):

@@ -99,6 +99,9 @@ def write(
                     placement_of(alignment, correction),
                 )
             else:
+                placement = placement_of(alignment, correction)
+                if placement is not None:
+                    gcps = _gcps_of_map(path, placement, alignment.options.allow)
                 notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
 
@@ -132,6 +135,13 @@ def write_in_place(alignment: Alignment) -> list[str]:
         for name in alignment.source.paths:
             notes += edit_in_place(Path(name), *correction_of_file(alignment, Path(name)), tags)
     return notes
+
+
+def _gcps_of_map(path: Path, placement: PixelMap, allow: str) -> tuple[Gcp, ...]:
+    from geodelreg.product.gcps.lattice import gcps_of_map
+
+    with open_raster(path, allow=allow) as reader:
+        return gcps_of_map(str(path), placement, reader.grid)
 
 
 def _check_header_holds(alignment: Alignment) -> None:

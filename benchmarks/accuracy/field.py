@@ -90,7 +90,7 @@ def run_case(case: Case, pair: BentPair) -> Row:
         ``rmse_px``, ``median_px``, ``best_affine_px``, ``normalised`` error, ``seconds`` and
         ``peak_mb`` of the command, which writes its report and no raster.
     """
-    from geodelreg.geo.maps.parsing import map_of_json
+    from geodelreg.geo.maps.field import FieldMap
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -113,9 +113,9 @@ def run_case(case: Case, pair: BentPair) -> Row:
         "peak_mb": usage.peak_mb,
     }
     written = found["correction"].get("pixel_map")
-    if written is None:
+    if written is None or written["kind"] != "field":
         return row
-    correction = map_of_json(written)
+    correction = FieldMap.from_json(written)
     error = _in_pan(pair, correction.forward(at)) - true
     row["jump_rows"] = written.get("jump_rows", [])
     if not case.length_px:

@@ -187,7 +187,7 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     options = build(AlignOptions, given)
     if not given["dry_run"] and not _carries_all(write_options):
         check_header_holds("field" if options.on_local == "field" else options.model)
-    if write_options.warp and _is_default("on_local"):
+    if _carries_all(write_options) and _is_default("on_local"):
         options = replace(options, on_local="field")
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")

@@ -28,6 +28,7 @@ _OBJECTS_TO_COLLECT = 50_000
 # name: (module that holds the click command of that name, line in the list of commands)
 COMMANDS = {
     "align": ("geodelreg_cli.align", "Correct the georeferencing of MS so that it fits PAN."),
+    "apply": ("geodelreg_cli.apply", "Apply a correction to other files of the scene."),
     "batch": ("geodelreg_cli.batch", "Align or check many pairs, with a ledger; also on Dask."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
     "figure": ("geodelreg_cli.figure", "Draw what a JSON report tells: before and after, arrows."),

@@ -116,7 +116,8 @@ def find_bands(
     heard = {p.band for p in _heard(found)}
 
     def further(near: BandPass) -> BandPass:
-        start = None if near.band in heard else _start(guess, part.pair, near.band, heard)
+        known = near.band in heard or not heard
+        start = None if known else _start(guess, part.pair, near.band, heard)
         return near if start is None else match_band(*where, start.then(correction), near.band)
 
     return list(pool.map(further, found))

@@ -9,7 +9,7 @@ from a spline through a coarser lattice, on which the map itself is asked.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,8 +20,11 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.door.opening import open_raster, own_name
+from geodelreg.geo.maps.header import header_map
+from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import FloatArray
+from geodelreg.values.raster import FloatArray, Grid
+from geodelreg.values.result import Correction
 
 TOLERANCE_PX = 1e-3
 """Of a source pixel, between the map and what is interpolated."""
@@ -52,6 +55,32 @@ class Lookup:
     nodes: FloatArray
     step: int
     rows: tuple[int, int]
+
+
+def lookups_of(
+    placement: PixelMap | None, correction: Correction, grid: Grid, shape: tuple[int, int]
+) -> Sequence[Lookup | None]:
+    """How the pixels of a target are found, for each part of the source that is smooth.
+
+    Parameters
+    ----------
+    placement : PixelMap or None
+        Source pixels to those of its original header; None where a geotransform says it all.
+    correction : Correction
+    grid : Grid
+        Of the target.
+    shape : (int, int)
+        Of the source.
+    """
+    if placement is None:
+        return [None]
+    header = header_map(grid, Grid(correction.original, shape, correction.crs_wkt))
+    found = []
+    for part, first, last in placement.pieces():
+        rows = tuple(round(min(max(row, 0.0), shape[0])) for row in (first, last))
+        if rows[0] < rows[1]:
+            found.append(make_lookup(header.then(Inverse(part)), grid.shape, (rows[0], rows[1])))
+    return found
 
 
 def make_lookup(there: PixelMap, shape: tuple[int, int], rows: tuple[int, int]) -> Lookup:

@@ -14,6 +14,7 @@ from affine import Affine
 from geodelreg.errors import GeodelregError, ReportError
 from geodelreg.geo.affine import affine_from_matrix
 from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.lattice import OnLattice
 from geodelreg.geo.maps.projective import ProjectiveMap
 from geodelreg.masking import MaskUse
@@ -124,6 +125,8 @@ def _input(given: Mapping[str, Any]) -> Input:
 
 
 def _map(found: Mapping[str, Any], shape: tuple[int, int]) -> PixelMap:
+    if found["pixel_map"]["kind"] == "field":
+        return FieldMap.from_json(found["pixel_map"])
     matrix = np.array(found["pixel_map"]["matrix"], dtype=np.float64)
     values = _floats(found["sigma_source_px"])
     sigma = OnLattice(values, shape) if values.any() else None

@@ -18,8 +18,6 @@ from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.grid import outline
-from geodelreg.geo.maps.header import header_map
-from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product import compare, metadata, sidecars
@@ -27,7 +25,7 @@ from geodelreg.product.atomic import staged
 from geodelreg.product.environment import gdal_session
 from geodelreg.product.geotiff import check_source
 from geodelreg.product.header import Provenance
-from geodelreg.product.lookup import Lookup, looked_up, make_lookup
+from geodelreg.product.lookup import looked_up, lookups_of
 from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
 from geodelreg.product.srs import keep, spatial_reference
 from geodelreg.product.targets import check_not_input
@@ -247,7 +245,7 @@ def _warp(
             notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
         profile = _profile(view, grid, validity)
         profile |= {key.lower(): value for key, value in creation.items()}
-        lookups = _lookups(placement, content.correction, grid, view.shape)
+        lookups = lookups_of(placement, content.correction, grid, view.shape)
         with ExitStack() as stack:
             parts = []
             for lookup in lookups:
@@ -262,21 +260,6 @@ def _warp(
     _copy_overviews(source, out, "nearest" if flags or resampling == "nearest" else "average")
     compare.check_decodable(out)
     return notes
-
-
-def _lookups(
-    placement: PixelMap | None, correction: Correction, grid: Grid, shape: tuple[int, int]
-) -> Sequence[Lookup | None]:
-    """How the pixels of the target are found, for each part of the source that is smooth."""
-    if placement is None:
-        return [None]
-    header = header_map(grid, Grid(correction.original, shape, correction.crs_wkt))
-    found = []
-    for part, first, last in placement.pieces():
-        rows = tuple(round(min(max(row, 0.0), shape[0])) for row in (first, last))
-        if rows[0] < rows[1]:
-            found.append(make_lookup(header.then(Inverse(part)), grid.shape, (rows[0], rows[1])))
-    return found
 
 
 def _resampling(

@@ -85,9 +85,10 @@ REMEDIES = (
     (
         {"local"},
         (
-            "--warp writes a field that follows the bend; --on-local warn writes the best affine "
-            "all the same, --max-residual PX allows more; a raster that is bent less in parts can "
-            "be cut (gdal_translate -srcwin) and aligned part by part."
+            "--warp writes a field that follows the bend, --georef gcps its control points; "
+            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
+            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
+            "part by part."
         ),
     ),
     (

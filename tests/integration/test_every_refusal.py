@@ -23,6 +23,7 @@ from geodelreg.batch import run
 from geodelreg.batch.job import Pair, Task
 from geodelreg.batch.supervisor import Child
 from geodelreg.errors import GeodelregError
+from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.image.reader import open_raster
 from geodelreg.options import WriteOptions
 from geodelreg.product.atomic import exclusive, write_text_atomically
@@ -31,6 +32,8 @@ from geodelreg.product.gcps import read_gcps
 from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.reading import read_report
+from geodelreg.product.stored import StoredCorrection
+from geodelreg.product.vectors import write_vector
 from tests.integration.raster_samples import GCPS, TAGS, UTM18, correction_of, make_cog
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -123,6 +126,12 @@ def in_child(
     return child.run(task)
 
 
+def stored(folder: Path) -> StoredCorrection:
+    """A correction that moves nothing."""
+    grid = Grid(GROUND, (80, 80), rasterio.crs.CRS.from_string(UTM18).to_wkt())
+    return StoredCorrection(folder / "report.json", grid, grid, "shift", IDENTITY, {})
+
+
 @dataclass(frozen=True)
 class Case:
     """What provokes an error, and which of these words its cause must name."""
@@ -168,6 +177,15 @@ CASES = {
     errors.FileLockedError: Case(locked, ("out.txt",)),
     errors.GcpFormatError: Case(
         lambda folder: read_gcps(text_file(folder, "gcps.points")), ("gcps.points",)
+    ),
+    errors.CorrectionMisfitError: Case(
+        lambda folder: stored(folder).check_share("mask.tif", 0.1), ("mask.tif", "report.json")
+    ),
+    errors.VectorUnreadableError: Case(
+        lambda folder: write_vector(
+            stored(folder), text_file(folder, "a.geojson"), folder / "b.geojson", False, False
+        ),
+        ("a.geojson",),
     ),
     errors.MaskError: Case(
         lambda folder: aligned(folder, AlignOptions(masks=(str(text_file(folder, "qa.tif")),))),

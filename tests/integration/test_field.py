@@ -23,7 +23,7 @@ from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, wri
 from benchmarks.scenes.truth import check_points
 from geodelreg import Alignment, AlignOptions, WriteOptions
 from geodelreg.errors import AlignmentRefusedError, UsageError
-from geodelreg.geo.maps.parsing import map_of_json
+from geodelreg.geo.maps.field import FieldMap
 from geodelreg.product.report import report_dict, report_schema
 from geodelreg_cli.main import cli
 
@@ -101,7 +101,7 @@ def test_without_an_output_for_it_the_refusal_names_what_carries_a_field(wavy: M
 def test_the_report_holds_the_map_itself(followed: Alignment) -> None:
     report = json.loads(json.dumps(report_dict(followed)))
     jsonschema.validate(report, report_schema())
-    again = map_of_json(report["correction"]["pixel_map"])
+    again = FieldMap.from_json(report["correction"]["pixel_map"])
     at = check_points((300, 300))
     assert np.abs(again.forward(at) - followed.solution.map.forward(at)).max() < 1e-9
     assert np.abs(again.sigma_at(at) - followed.solution.map.sigma_at(at)).max() < 1e-9

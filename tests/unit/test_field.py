@@ -14,7 +14,6 @@ from geodelreg.fit.jumps import find_jumps
 from geodelreg.fit.residual import residual_of, shared_by_neighbours
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap
-from geodelreg.geo.maps.parsing import map_of_json
 
 Array = NDArray[np.float64]
 SIDE = 440.0
@@ -164,7 +163,7 @@ def test_a_jump_is_found_to_a_row_of_patches_and_cut(amplitude: float) -> None:
 
 def test_a_field_out_of_its_numbers_is_the_same_map() -> None:
     fit, at = fitted(200.0, seed=6), places(np.random.default_rng(7))
-    again = map_of_json(json.loads(json.dumps(fit.to_json())))
+    again = FieldMap.from_json(json.loads(json.dumps(fit.to_json())))
     np.testing.assert_array_equal(again.forward(at), fit.forward(at))
 
 

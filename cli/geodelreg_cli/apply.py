@@ -1,0 +1,100 @@
+"""``geodelreg apply``: a correction that was found before, for other files of the scene."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import click
+
+from geodelreg.errors import shown
+from geodelreg.options import AlignOptions, WriteOptions
+from geodelreg_cli.console import configure_logging
+from geodelreg_cli.options import (
+    RUN,
+    SectionCommand,
+    add_options,
+    build,
+    keep_to,
+    knob_option,
+    knob_options,
+)
+
+FILE = click.Path(path_type=Path)
+
+EPILOG = """\
+Examples:
+
+  The same correction for the mask and the 20 m bands of a scene; OUT is a folder:
+    geodelreg align ms.tif pan.tif -o aligned.tif --report correction.json
+    geodelreg apply correction.json mask.tif B05.tif B06.tif -o aligned/
+
+  A field, which no header holds, resampled onto the grid of PAN:
+    geodelreg apply correction.json mask.tif -o mask_on_pan.tif --warp --grid pan -r nearest
+
+  Tie points or field boundaries that were drawn on MS:
+    geodelreg apply correction.json fields.geojson -o fields_aligned.geojson
+
+Exit codes: 0 done, 1 failed, 2 wrong usage.
+"""
+
+
+@add_options(
+    [
+        *knob_options(WriteOptions, "How OUT is written", without=["georef"]),
+        knob_option(AlignOptions, "allow", RUN),
+    ]
+)
+@click.command(cls=SectionCommand, epilog=EPILOG)
+@click.argument("correction", metavar="CORRECTION.json", type=FILE)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=FILE)
+@click.option(
+    "-o", "--output", type=FILE, metavar="OUT", help="Output; of several files the folder for them."
+)
+@click.option("--in-place", is_flag=True, help="Correct the headers of the files themselves.")
+@click.option("--force", is_flag=True, help="Also where a file lies elsewhere than MS did.")
+@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
+@click.option("-v", "--verbose", count=True, help="Print the steps; -vv everything.")
+@click.option("--debug", is_flag=True, help="Print a traceback with an error.")
+def apply(
+    correction: Path,
+    files: tuple[Path, ...],
+    output: Path | None,
+    in_place: bool,
+    force: bool,
+    quiet: bool,
+    verbose: int,
+    debug: bool,
+    **given: Any,
+) -> None:
+    """Apply the correction in a report of align to other files with the same error.
+
+    Rasters of any pixel size and CRS get a corrected header and keep their pixels, or are resampled
+    (--warp). GeoJSON, GeoPackage and CSV files (columns lon,lat, or x,y in the CRS of MS) get
+    corrected coordinates. Of several files all are written or none.
+    """
+    configure_logging(verbose, quiet, debug)
+    keep_to(given["allow"])
+    if (output is None) != in_place:
+        raise click.UsageError("Say where the result goes: one of -o OUT, --in-place.")
+    options = build(WriteOptions, given | {"georef": "geotransform"})
+    if in_place and options != WriteOptions():
+        raise click.UsageError("--in-place corrects the header and nothing else.")
+    import geodelreg
+    from geodelreg.product.atomic import together
+    from geodelreg_cli.outputs import raster_targets
+
+    targets = [] if output is None else raster_targets([str(file) for file in files], output)
+    if len(files) > 1 and output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+    with together(files if in_place else targets, lambda: [correction, *files]):
+        for number, file in enumerate(files):
+            target = targets[number] if targets else None
+            notes = geodelreg.apply(
+                correction, file, target, options, force=force, allow=given["allow"]
+            )
+            for note in notes:
+                logging.getLogger(__name__).warning("warning: %s", note)
+            if not quiet:
+                click.echo(f"{shown(str(target or file))}: corrected", err=True)

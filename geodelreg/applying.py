@@ -1,0 +1,112 @@
+"""What users call to apply a correction, found before, to other files of the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from geodelreg.door.names import as_path
+from geodelreg.door.opening import allowing
+from geodelreg.errors import UsageError
+from geodelreg.image.reader import open_raster
+from geodelreg.options import WriteOptions, check_header_holds
+from geodelreg.product.stored import StoredCorrection, read_correction
+from geodelreg.writing import AnyPath, input_paths
+
+
+def apply(
+    correction: AnyPath,
+    source: AnyPath,
+    target: AnyPath | None = None,
+    options: WriteOptions | None = None,
+    *,
+    force: bool = False,
+    allow: str = "local",
+) -> list[str]:
+    """Apply the correction of an alignment to another file that shares the header's error.
+
+    Bands at another resolution, masks and products of a scene are placed by the same header as the
+    MS raster that was aligned, and are off by the same amount.
+
+    Parameters
+    ----------
+    correction : path
+        The report of the alignment.
+    source : path
+        A raster in any CRS and of any pixel size; or a vector file: GeoJSON, GeoPackage, CSV.
+    target : path, optional
+        The output; without it the header of the raster itself is corrected.
+    options : WriteOptions, optional
+        Its `warp` resamples, which a field needs.
+    force : bool
+        Also where the file lies elsewhere than the raster that was aligned.
+    allow : str
+        What may be opened, as in `AlignOptions`.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    ReportError
+        `correction` is broken, of another kind, or of a refusal.
+    CorrectionMisfitError
+        `source` lies elsewhere.
+    UsageError
+        No header holds the correction.
+    OutputExistsError, OutputUnwritableError, ...
+        Nothing is then changed on disk.
+    """
+    from geodelreg.product.atomic import together
+    from geodelreg.product.vectors import VECTORS, write_vector
+
+    options = options or WriteOptions()
+    stored = read_correction(as_path(str(correction)))
+    file = as_path(str(source))
+    if file.suffix.lower() in VECTORS:
+        if target is None:
+            raise UsageError(f"{file} is a vector file, which has no header", "Name an output.")
+        with together(inputs=lambda: [file, stored.path]):
+            write_vector(stored, file, Path(target), options.overwrite, force)
+        return []
+    with allowing(allow):
+        return _apply_to_raster(stored, file, target, options, force, allow)
+
+
+def _apply_to_raster(
+    stored: StoredCorrection,
+    file: Path,
+    target: AnyPath | None,
+    options: WriteOptions,
+    force: bool,
+    allow: str,
+) -> list[str]:
+    from geodelreg.product.atomic import together
+    from geodelreg.product.geotiff import write_corrected
+    from geodelreg.product.inplace import edit_in_place
+    from geodelreg.product.sidecars import stale_beside
+    from geodelreg.product.targets import check_replaceable
+    from geodelreg.product.warp import write_warped
+
+    with open_raster(file, allow=allow) as reader:
+        grid = reader.grid
+    if not force:
+        stored.check_fits(str(file), grid)
+    correction, placement = stored.of_raster(grid)
+    if placement is not None and not options.warp:
+        check_header_holds(stored.model)
+        raise UsageError(
+            f"{file} is in another CRS, in which the correction is no affine", "Resample (--warp)."
+        )
+    if target is None:
+        with together([file]):
+            return edit_in_place(file, correction, (), stored.tags)
+    out = Path(target)
+    with together([out], lambda: [*input_paths([str(file)], allow), stored.path]):
+        check_replaceable(out, options.overwrite, stale_beside(out, file))
+        if not options.warp:
+            return write_corrected(file, out, correction, (), stored.tags, options)
+        return write_warped(
+            file, out, correction, stored.reference, stored.tags, options, placement=placement
+        )
