@@ -82,8 +82,13 @@ def error_map(points: TiePoints, frame: Frame) -> FloatArray:
 
 
 def sigma_map(frame: Frame) -> FloatArray:
-    """(n, m) standard error of the correction in each cell, PAN pixels; NaN beyond MS."""
+    """(n, m) standard error of the correction in each cell, PAN pixels; NaN beyond MS.
+
+    NaN everywhere of a map that has none: it is not known then, and not 0.
+    """
     at = cells(frame)
+    if not frame.sigma.values.any():
+        return np.full(at.shape[:2], np.nan)
     flat = at.reshape(-1, 2)
     there = np.nan_to_num(frame.to_ms(flat, corrected=True))
     sigma = frame.sigma(there) * frame.pan_px_per_ms_px

@@ -82,6 +82,8 @@ def test_a_refusal_has_its_page_with_the_reasons_and_the_candidate(made: Path) -
     for message in failed:
         assert page.text.count(message) == 2  # above, and beside its bar
     assert page.all("img", **{"data-view": "after"})
+    assert "How sure it is" not in page.text  # of nothing found, nothing is known
+    assert "squares 1, 2 and 3" not in page.text
 
 
 def test_the_command_on_the_page_finds_the_same_again(made: Path, tmp_path: Path) -> None:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from geodelreg.options import AlignOptions
 from geodelreg.report.frame import frame_of
 from geodelreg.report.places import places
-from geodelreg.report.residuals import error_map
+from geodelreg.report.residuals import error_map, sigma_map
 from geodelreg.report.words import bar, command, story
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment, Outcome, Reason, Verdict
-from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, SHIFTED, UTM16, alignment
+from tests.unit.alignment_sample import MS_HEADER, PAN_HEADER, SHIFTED, UTM16, alignment, refused
 
 SIDE = 12
 """Patches along an axis of MS, 100 × 80 pixels."""
@@ -136,6 +136,10 @@ def test_the_map_of_what_is_left_is_large_where_the_fault_is() -> None:
     away[[14, 70, 120]] = True
     made = alignment(tie_points=patches(residual, away))
     assert np.nanmax(error_map(made.tie_points, frame_of(made))) < 0.2
+
+
+def test_of_a_map_without_standard_errors_none_is_shown() -> None:
+    assert np.isnan(sigma_map(frame_of(refused()))).all()
 
 
 def test_without_points_the_middle_is_shown() -> None:
