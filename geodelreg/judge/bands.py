@@ -33,7 +33,7 @@ _CLEARLY = 0.97
 """Of the unexplained detail: bands that were moved have 0.86 and less, others 1.00 and more."""
 _DETAIL_PX = 2.0
 """Of the overview: only detail finer than this tells one place from the next."""
-_FAR_PX = 1.0  # of the overview: what lies nearer, dense matching has looked at
+_FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
 
 @dataclass(frozen=True, slots=True)
