@@ -68,6 +68,25 @@ def log10_binomial_tail(successes: int, trials: int, probability: float) -> floa
     return min(float(np.logaddexp.reduce(terms)) / _LN_10, 0.0)
 
 
+def log10_signed_rank_tail(differences: FloatArray) -> float:
+    """log10 of P(sum of the ranks of positive values as large), were signs a matter of chance.
+
+    By the normal approximation to Wilcoxon's statistic (1945, doi:10.2307/3001968), whose mean and
+    variance are exact.
+
+    Parameters
+    ----------
+    differences : (N,) float64
+        At least one.
+    """
+    from scipy.special import log_ndtr
+
+    rank = np.argsort(np.argsort(np.abs(differences), kind="stable"), kind="stable") + 1.0
+    excess = float(rank[differences > 0].sum() - rank.sum() / 2)
+    spread = math.sqrt(float((rank**2).sum())) / 2
+    return float(log_ndtr(-excess / spread)) / _LN_10
+
+
 def _log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:
     """Natural logarithm of the numbers of ways to choose k of n."""
     log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, np.max(n) + 1)))])

@@ -33,7 +33,8 @@ _CLEARLY = 0.97
 """Of the unexplained detail: bands that were moved have 0.86 and less, others 1.00 and more."""
 _DETAIL_PX = 2.0
 """Of the overview: only detail finer than this tells one place from the next."""
-_FAR_PX = 1.0  # of the overview: what lies nearer, dense matching has looked at
+_ALL_VALID = 0.99  # share of a pixel that was resampled; the rest is rounding
+_FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +194,7 @@ def _unexplained(
     there = cv2.warpAffine(shown[band], matrix, (width, height), flags=how)
     usable = cv2.warpAffine(valid.astype(np.float32), matrix, (width, height), flags=how)
     window = np.ones((2 * round(3 * _DETAIL_PX) + 1,) * 2, dtype=np.uint8)
-    inner = cv2.erode((valid & (usable > 0.99)).astype(np.uint8), window) > 0
+    inner = cv2.erode((valid & (usable > _ALL_VALID)).astype(np.uint8), window) > 0
     if not inner.any():
         return 1.0
     others = np.stack([_detail(one)[inner] for n, one in enumerate(shown) if n != band])

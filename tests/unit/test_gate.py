@@ -14,7 +14,7 @@ from scipy import stats
 
 import geodelreg
 from geodelreg.errors import AlignmentRefusedError
-from geodelreg.fit.chance import log10_binomial_tail
+from geodelreg.fit.chance import log10_binomial_tail, log10_signed_rank_tail
 from geodelreg.judge.verdict import Evidence, is_worthwhile, judge, nothing_agrees, verdict
 from geodelreg.options import AlignOptions
 from geodelreg.values.result import Outcome
@@ -186,3 +186,12 @@ def test_a_correction_beyond_what_was_allowed_names_the_limits() -> None:
     far = replace(GOOD, shift_px=40.0)
     found = verdict(judge(far, AlignOptions(max_shift_px=9.0)), moves=True)
     assert "--max-shift" in found.remedy
+
+
+@pytest.mark.parametrize("shift", [-0.5, 0.0, 0.5, 2.0])
+def test_signed_rank_tail_is_scipys(shift: float) -> None:
+    values = np.random.default_rng(3).normal(shift, 1.0, 40)
+    expected = stats.wilcoxon(
+        values, alternative="greater", correction=False, method="approx"
+    ).pvalue
+    assert log10_signed_rank_tail(values) == pytest.approx(math.log10(expected), rel=1e-6)
