@@ -50,6 +50,7 @@ _TILT_PX = 0.1
 _FEWEST_POINTS = 4
 _BENT_TRIES = 2  # of the guesses that one affine could not make good
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
+_PARTS = 16  # of it, for the judging of all guesses together
 
 
 class Found(NamedTuple):
@@ -125,7 +126,7 @@ def align_pair(
             model, counts = found.fitted.selection.estimate.model, found.fitted.counts
             more = {step: counts[step] for step in counts if step not in guess.counts}
             logger.info("refined: %s, model %s", _listed(more), model)
-            report(_FOUND + (1 + 3 * looked) / 16, "judging")
+            report(_FOUND + (1 + 3 * looked) / _PARTS, "judging")
             solution = conclude(seen, found, heard)
             for reason in solution.verdict.reasons:
                 if not reason.passed:

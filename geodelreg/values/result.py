@@ -17,6 +17,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import Grid
+from geodelreg.values.remedies import remedy_for
 
 _Item = TypeVar("_Item")
 
@@ -81,56 +82,6 @@ class Reason:
     message: str
 
 
-REMEDIES = (
-    (
-        {"local"},
-        (
-            "--warp writes a field that follows the bend, --georef gcps its control points; "
-            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
-            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
-            "part by part."
-        ),
-    ),
-    (
-        {"two_motions", "local"},
-        (
-            "Mask the part that moves (--mask), or cut the raster there (gdal_translate -srcwin) "
-            "and align each part."
-        ),
-    ),
-    (
-        {"bands", "bands_apart"},
-        (
-            "The bands of MS do not agree, or show clouds: match on one of them (--band N); the "
-            "correction is then right for the bands that lie with it."
-        ),
-    ),
-    (
-        {"max_shift", "max_rotation", "max_scale"},
-        (
-            "A correction was found that is larger than you allowed (--max-shift, --max-rotation, "
-            "--max-scale): allow more if the header may be so far off."
-        ),
-    ),
-    (
-        {"rival"},
-        (
-            "The images fit elsewhere nearly as well: repeated texture, or one of them is shaded "
-            "like relief. Try --band with the band that looks most like PAN, or a larger part of "
-            "the scene."
-        ),
-    ),
-    (
-        {"sigma_px", "coverage", "disagreement_px"},
-        (
-            "Too little of the overlap shows common ground to know its corners: a simpler --model "
-            "needs less of it, and masks may hide too much."
-        ),
-    ),
-)
-"""What can be done when no other reasons than these refuse; the first that holds them counts."""
-
-
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Outcome with the evidence behind it."""
@@ -152,13 +103,7 @@ class Verdict:
     @property
     def remedy(self) -> str:
         """What can be done about a refusal."""
-        for names, text in REMEDIES:
-            if self._failed and self._failed <= names:
-                return text
-        return (
-            "Check that both show the same ground; try --band with the band that looks most like "
-            "PAN, a larger --search-radius, or a simpler --model; mask clouds (--mask)."
-        )
+        return remedy_for(self._failed)
 
     @property
     def _failed(self) -> set[str]:

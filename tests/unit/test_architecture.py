@@ -17,6 +17,21 @@ HALVES_OF_OTHER_THINGS = {
     "Rectangle((columns.start - 0.5, rows.start - 0.5), *size, fill=False, ec=_ACCENT, lw=1.5)": (
         "matplotlib draws pixel (0, 0) of an image from -0.5 to 0.5"
     ),
+    "geodelreg/report/figures.py: "
+    'values, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="cividis", alpha=0.8,': (
+        "matplotlib draws pixel (0, 0) of an image from -0.5 to 0.5"
+    ),
+    "geodelreg/report/figures.py: "
+    "axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))": (
+        "matplotlib draws pixel (0, 0) of an image from -0.5 to 0.5"
+    ),
+    "geodelreg/report/residuals.py: start + (np.arange(count) + 0.5) * size / count": (
+        "the middle of each part of a window"
+    ),
+    "geodelreg/report/words.py: "
+    'halves = {low: share < 0.5, high: share > 0.5, "middle": np.abs(share - 0.5) < 0.25}': (
+        "the middle of the picture"
+    ),
 }
 
 

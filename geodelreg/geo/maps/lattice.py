@@ -8,6 +8,8 @@ import numpy as np
 
 from geodelreg.values.raster import FloatArray
 
+_DECIMALS = 9  # of a step: beyond them is only rounding of the division
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnLattice:
@@ -28,7 +30,7 @@ class OnLattice:
         """(N,) values at (N, 2) pixels; beyond the raster those of its edge."""
         steps = np.array(self.values.shape[::-1]) - 1
         # rounded so that a place of the lattice has the value of that place, and no neighbour's
-        at = np.round(np.clip(np.asarray(xy) / self.shape[::-1] * steps, 0, steps), 9)
+        at = np.round(np.clip(np.asarray(xy) / self.shape[::-1] * steps, 0, steps), _DECIMALS)
         first = np.minimum(at.astype(np.intp), np.maximum(steps - 1, 0))
         (x, y), (column, row) = (at - first).T, first.T
         right, below = np.minimum(column + 1, steps[0]), np.minimum(row + 1, steps[1])

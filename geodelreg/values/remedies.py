@@ -1,0 +1,67 @@
+"""What can be done about a refusal, by the reasons that refused."""
+
+from __future__ import annotations
+
+from collections.abc import Set as AbstractSet
+
+_REMEDIES = (
+    (
+        {"local"},
+        (
+            "--warp writes a field that follows the bend, --georef gcps its control points; "
+            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
+            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
+            "part by part."
+        ),
+    ),
+    (
+        {"two_motions", "local"},
+        (
+            "Mask the part that moves (--mask), or cut the raster there (gdal_translate -srcwin) "
+            "and align each part."
+        ),
+    ),
+    (
+        {"bands", "bands_apart"},
+        (
+            "The bands of MS do not agree, or show clouds: match on one of them (--band N); the "
+            "correction is then right for the bands that lie with it."
+        ),
+    ),
+    (
+        {"max_shift", "max_rotation", "max_scale"},
+        (
+            "A correction was found that is larger than you allowed (--max-shift, --max-rotation, "
+            "--max-scale): allow more if the header may be so far off."
+        ),
+    ),
+    (
+        {"rival"},
+        (
+            "The images fit elsewhere nearly as well: repeated texture, or one of them is shaded "
+            "like relief. Try --band with the band that looks most like PAN, or a larger part of "
+            "the scene."
+        ),
+    ),
+    (
+        {"sigma_px", "coverage", "disagreement_px"},
+        (
+            "Too little of the overlap shows common ground to know its corners: a simpler --model "
+            "needs less of it, and masks may hide too much."
+        ),
+    ),
+)
+"""What can be done when no other reasons than these refuse; the first that holds them counts."""
+
+_OTHERWISE = (
+    "Check that both show the same ground; try --band with the band that looks most like PAN, a "
+    "larger --search-radius, or a simpler --model; mask clouds (--mask)."
+)
+
+
+def remedy_for(failed: AbstractSet[str]) -> str:
+    """What helps when these reasons refused, in a sentence or two."""
+    for names, text in _REMEDIES:
+        if failed and failed <= names:
+            return text
+    return _OTHERWISE
