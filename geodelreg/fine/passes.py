@@ -33,6 +33,7 @@ _PASSES_FROM_AFAR = 3
 _SOME_TILES = 2
 _MANY_TILES = 5  # unexplained: ablate
 _LAST_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
+_MANY_PATCHES = 200  # fewer follow the tone of the proof; unexplained: ablate
 _ONLY_TOLERANCE = 0.0015  # of a patch pixel, where no pass of full resolution goes before
 _LAST_ITERATIONS = 5  # unexplained: ablate
 _FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
@@ -89,7 +90,8 @@ def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) ->
     ----------
     part : Roles
     images : Overview
-        Which the proof is over; where they are not decimated, it stands for the first passes.
+        Which the proof is over; where they are not decimated and many patches agree, it stands for
+        the first passes of full resolution.
     tuning : Tuning
         Of the proof.
     proof : Pass
@@ -109,7 +111,7 @@ def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) ->
     # a tone fitted at another sharpness, as the proof's was, draws the point spread towards that
     tuning = replace(tuning, tone=fit_tone(part, some, near, DEFAULT_SIGMA, _FEWER_SAMPLES))
     tuning = replace(tuning, sigma=fit_sigma(part, some, near, agreed, tuning, size))
-    if _are_coarse(part, overview_tile(part, images)):
+    if proof.kept < _MANY_PATCHES or _are_coarse(part, overview_tile(part, images)):
         last = match_pass(part, some, near, tuning, options)
     found = Refinement(part, some, tuning, last, size)
     if not last.is_calm or found.is_blurred:
