@@ -25,6 +25,8 @@ from benchmarks.scenes.truth import check_points
 
 Array = NDArray[np.float64]
 PAN_PX, MS_PX, RATIO = 2000, 450, 4.0
+ENOUGH = 0.95
+"""Of the side of PAN: the rest is mirrored."""
 TEXTURES = {"satellite": sentinel2, "aerial": aerial}
 AMPLITUDES_PX = (1.0, 2.0, 3.0)
 LENGTHS_PX = (600, 800, 1200, 1600, 2400)
@@ -57,11 +59,10 @@ class Case:
         what = f"{self.amplitude_px:g} px / {self.length_px:g} px" if self.length_px else JUMP
         return f"{self.texture}, {what}"
 
-    @property
-    def bend(self) -> Bend:
-        """What the pair's header does not express."""
+    def bend(self, side_px: int) -> Bend:
+        """What the pair's header does not express, on a PAN raster of that side."""
         if not self.length_px:
-            return Tear(JUMP_PX, JUMP_SHARE, 0.0, (PAN_PX, PAN_PX))
+            return Tear(JUMP_PX, JUMP_SHARE, 0.0, (side_px, side_px))
         seed = round(1000 * self.amplitude_px + self.length_px)
         return waves(self.amplitude_px, self.length_px, np.random.default_rng(seed))
 
@@ -75,10 +76,13 @@ def cases() -> Iterator[Case]:
 
 
 def make(case: Case, imagery: Imagery) -> BentPair:
-    """The pair of a case."""
-    error = HeaderError((2.3, -1.7))
-    spec = SceneSpec(case.name, case.name, error, (PAN_PX, PAN_PX), (MS_PX, MS_PX), RATIO)
-    return BentPair(make_scene(spec, imagery, case.bend), case.bend)
+    """The pair of a case; smaller where the imagery is, for mirrored ground would repeat itself."""
+    least = min(imagery.shape)
+    side = PAN_PX if least > ENOUGH * PAN_PX else least
+    ms = round(MS_PX * side / PAN_PX)
+    error, bend = HeaderError((2.3, -1.7)), case.bend(side)
+    spec = SceneSpec(case.name, case.name, error, (side, side), (ms, ms), RATIO)
+    return BentPair(make_scene(spec, imagery, bend), bend)
 
 
 def run_case(case: Case, pair: BentPair) -> Row:
@@ -119,7 +123,7 @@ def run_case(case: Case, pair: BentPair) -> Row:
     error = _in_pan(pair, correction.forward(at)) - true
     row["jump_rows"] = written.get("jump_rows", [])
     if not case.length_px:
-        border = _jump_row(case, pair)
+        border = _jump_row(pair)
         row["true_jump_row"] = border
         error = error[np.abs(at[:, 1] - border) > AWAY_MS_PX]
         at = at[np.abs(at[:, 1] - border) > AWAY_MS_PX]
@@ -139,10 +143,11 @@ def _in_pan(pair: BentPair, header_px: Array) -> Array:
     return pair.to_pan(truth, Affine(*truth.ms_header), header_px)
 
 
-def _jump_row(case: Case, pair: BentPair) -> float:
+def _jump_row(pair: BentPair) -> float:
     """MS row at which the content jumps."""
-    rows = np.linspace(0, MS_PX, 40 * MS_PX)
-    at = np.stack([np.full(len(rows), MS_PX / 2), rows], axis=1)
+    height, width = pair.scene.truth.ms_shape
+    rows = np.linspace(0, height, 40 * height)
+    at = np.stack([np.full(len(rows), width / 2), rows], axis=1)
     step = np.abs(np.diff(pair.pan_px(at), axis=0)).sum(axis=1)
     return float(rows[np.argmax(step)])
 
@@ -197,8 +202,9 @@ def run(args: argparse.Namespace) -> int:
     text = table(rows)
     if args.docs:
         about = (
-            f"`python -m benchmarks field`: PAN {PAN_PX}², MS {MS_PX}² at 4:1, waves of so many "
-            f"PAN px and so long, and a jump of {JUMP_PX[0]:g} px along a row (RMSE away from "
+            f"`python -m benchmarks field`: PAN {PAN_PX}², MS {MS_PX}² at 4:1 (smaller where the "
+            f"imagery is), waves of so many PAN px and so long, and a jump of "
+            f"{JUMP_PX[0]:g} px along a row (RMSE away from "
             f'it), on {machine()}.  "Normalised" is the error over its standard error, RMS.  '
             f"Time and memory are the whole command's, without writing pixels.  Median scene: "
             f"{np.median(waved):.3f} px."
