@@ -40,7 +40,8 @@ from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
 from geodelreg.values.raster import StatusArray, WindowReader
-from geodelreg.values.result import Accuracy, Solution, Timings
+from geodelreg.values.result import Accuracy, Solution
+from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
 

@@ -49,6 +49,16 @@ class Alignment(result.Alignment):
         return self.at_centre.shift_m
 
     @property
+    def found(self) -> result.Solution:
+        """What the images say, whether it was believed or not: the solution."""
+        return self.solution
+
+    @property
+    def search(self) -> Any:
+        """Of the solution."""
+        return self.solution.search
+
+    @property
     def step_counts(self) -> Mapping[str, int]:
         """Of the solution."""
         return self.solution.step_counts

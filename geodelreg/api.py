@@ -27,7 +27,8 @@ from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
-from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution, Timings
+from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution
+from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.options import AlignOptions
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Window, WindowReader
-from geodelreg.values.result import Timings
+from geodelreg.values.timings import Timings
 
 MOST_BANDS = 12
 """Bands of a hyperspectral image that are matched on at most."""

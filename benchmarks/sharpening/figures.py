@@ -14,7 +14,7 @@ from benchmarks.sharpening.pairs import Known
 if TYPE_CHECKING:
     from benchmarks.sharpening.wald import Row
 
-_CROPPED = {"worldview2_city": "wald_city.png", "sentinel2 4:1": "wald_coast.png"}
+_CROPPED = {"landsat8_momotombo": "wald_volcano.png", "sentinel2 4:1": "wald_coast.png"}
 _CROP_PX = 120
 
 

@@ -41,7 +41,7 @@ _IMAGES = """![ERGAS and SAM against the misalignment](images/wald.png)
 
 Crops of a real pair at 2:1 and of a simulated one at 4:1, 3 PAN px off:
 
-![A city, 2:1](images/wald_city.png)
+![A volcano, 2:1](images/wald_volcano.png)
 ![A coast, 4:1](images/wald_coast.png)"""
 
 

@@ -21,6 +21,7 @@ _CLIP_SIGMAS = 3.0
 _ALL_VALID = 0.99  # share of a pixel, when decimated; the rest is rounding
 _LEAST_SHARE = 1e-3  # of weight: means of less are not asked for
 _LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
+_VERTEX_STEPS = 32  # a pixel: finer than the parabola is true
 _PEAK_PX = 8  # further off is another place; unexplained: ablate
 
 
@@ -73,7 +74,10 @@ def _vertex(scores: Float32Array, best: int) -> float:
         return float(best)
     before, here, after = (float(score) for score in scores[best - 1 : best + 2])
     bend = before - 2 * here + after
-    return best + (before - after) / (2 * bend) if bend < 0 else float(best)
+    if not bend < 0:
+        return float(best)
+    # a step of its own, for the last bits of a Fourier transform depend on where its memory lies
+    return best + round((before - after) / (2 * bend) * _VERTEX_STEPS) / _VERTEX_STEPS
 
 
 def around(centre: int, reach: int) -> slice:

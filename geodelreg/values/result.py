@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from time import perf_counter
-from typing import TypeVar
 
 import numpy as np
 from affine import Affine
@@ -18,8 +15,6 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.remedies import remedy_for
-
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,39 +312,3 @@ class Alignment:
         centre = np.array([[width / 2, height / 2]])
         local = self.solution.map.linearise(centre)[0].ravel().tolist()
         return Affine(*local) @ Affine.translation(*-centre[0])
-
-
-class Timings(dict[str, float]):
-    """Seconds of each step by its name; the caller owns it and the steps add to it.
-
-    A step inside another counts for itself alone, so that all of them add up to the whole.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._began = perf_counter()
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds since it was made."""
-        return perf_counter() - self._began
-
-    def each(self, step: str, items: Iterator[_Item]) -> Iterator[_Item]:
-        """The items, the making of each timed as `step`."""
-        while True:
-            with self(step):
-                try:
-                    item = next(items)
-                except StopIteration:
-                    return
-            yield item
-
-    @contextmanager
-    def __call__(self, step: str) -> Iterator[None]:
-        """Time a step; steps of one thread only."""
-        start, others = perf_counter(), sum(self.values())
-        try:
-            yield
-        finally:
-            inside = sum(self.values()) - others
-            self[step] = self.get(step, 0.0) + perf_counter() - start - inside
