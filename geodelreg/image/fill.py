@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geodelreg.image.environment import gdal_calls
-
-if TYPE_CHECKING:
-    from rasterio.io import DatasetReader
+from geodelreg.values.raster import Window
 
 _SIDE_PX = 32
 """Of the squares that are looked at: no ground is the same over a thousand pixels."""
 
 
-def undeclared_fill(dataset: DatasetReader, bands: Sequence[int]) -> float | None:
+def undeclared_fill(
+    read: Callable[[Window], NDArray[Any]], shape: tuple[int, int], dtype: str
+) -> float | None:
     """The value that fills a corner of all bands up to the border; None without one.
 
     Scenes that were turned, cut or mosaicked are filled up to a rectangle, which takes in a corner.
@@ -24,32 +24,28 @@ def undeclared_fill(dataset: DatasetReader, bands: Sequence[int]) -> float | Non
 
     Parameters
     ----------
-    dataset : DatasetReader
-        Without no-data value or mask.
-    bands : sequence of int
-        Numbers of the image bands.
+    read : callable
+        Pixels (B, h, w) of a window of the image bands, of a file that declares neither no-data
+        nor masks.
+    shape : tuple of int
+        ``(height, width)``
+    dtype : str
     """
-    height, width = dataset.shape
+    height, width = shape
     side = min(_SIDE_PX, height // 4, width // 4)
     if side < 2:
         return None
-    with gdal_calls():
-        corners = [
-            _constant(dataset, bands, row, column, side)
-            for row in (0, height - side)
-            for column in (0, width - side)
-        ]
-        fill = next((value for value in corners if value in _fills(dataset.dtypes[0])), None)
-        middle = _constant(dataset, bands, (height - side) // 2, (width - side) // 2, side)
-    return None if fill is None or middle == fill else fill
 
+    def constant(row: int, column: int) -> float | None:
+        """The one value of a square in all bands; None of several."""
+        square = read(Window(column, row, side, side))
+        return float(square.flat[0]) if (square == square.flat[0]).all() else None
 
-def _constant(
-    dataset: DatasetReader, bands: Sequence[int], row: int, column: int, side: int
-) -> float | None:
-    """The one value of a square in all bands; None of several."""
-    square = dataset.read(list(bands), window=((row, row + side), (column, column + side)))
-    return float(square.flat[0]) if (square == square.flat[0]).all() else None
+    corners = [constant(row, column) for row in (0, height - side) for column in (0, width - side)]
+    fill = next((value for value in corners if value in _fills(dtype)), None)
+    if fill is None or constant((height - side) // 2, (width - side) // 2) == fill:
+        return None
+    return fill
 
 
 def _fills(dtype: str) -> tuple[float, ...]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -116,7 +116,13 @@ class RasterFile:
         declares = any(value is not None for value in self.dataset.nodatavals)
         if declares or self._alpha or self._masked_bands or self.block_note:
             return None
-        return undeclared_fill(self.dataset, self.image_bands)
+        height, width = self.grid.shape
+
+        def read(window: Window) -> NDArray[Any]:
+            with self._decoding(window):
+                return _read(self.dataset, self.image_bands, window)
+
+        return undeclared_fill(read, (height, width), self.dataset.dtypes[0])
 
     @property
     def block_note(self) -> str:
@@ -229,16 +235,14 @@ class RasterFile:
             self._placements[overview] = find_placement(read_patch, shape, self.grid.shape)
         return self._placements[overview]
 
-    def _pixels(
-        self, numbers: Sequence[int], window: Window, level: DatasetReader
-    ) -> tuple[Float32Array, BoolArray | None]:
-        """Pixels of one level, 0 where invalid, and their validity; None stands for all valid."""
+    @contextmanager
+    def _decoding(self, window: Window) -> Iterator[None]:
+        """Reading of a window, with its errors in words."""
         from rasterio.errors import RasterioError
 
         try:
             with gdal_calls():
-                raw = _read(level, numbers, window)
-                masks = self._masks(numbers, window, level)
+                yield
         except (RasterioError, OSError, MemoryError, ValueError, SystemError) as error:
             reason = " ".join(str(error.__cause__ or error).split())
             raise RasterUnreadableError(
@@ -247,6 +251,14 @@ class RasterFile:
                 f"{window.row + window.height} cannot be decoded ({reason})",
                 "The file is truncated or damaged: copy or download it again.",
             ) from error
+
+    def _pixels(
+        self, numbers: Sequence[int], window: Window, level: DatasetReader
+    ) -> tuple[Float32Array, BoolArray | None]:
+        """Pixels of one level, 0 where invalid, and their validity; None stands for all valid."""
+        with self._decoding(window):
+            raw = _read(level, numbers, window)
+            masks = self._masks(numbers, window, level)
         nodata = [level.nodatavals[number - 1] for number in numbers]
         if self.nodata is not None:
             nodata = [self.nodata] * len(numbers)
