@@ -172,9 +172,9 @@ def _arrows(alignment: Alignment, canvas: Canvas) -> dict[str, Any]:
         "away_count": int((~found.kept).sum()),
         "key": f"{found.key_px:g} PAN px",
         "key_path": drawing.arrow_path(
-            np.array([[4.0, 10.0]]), np.array([[4.0 + found.key_length, 10.0]])
+            np.array([[0.0, 10.0]]), np.array([[found.key_length, 10.0]])
         ),
-        "key_length": found.key_length + 12,
+        "key_length": found.key_length,
         "magnified": short(found.magnified),
     }
 
