@@ -102,7 +102,7 @@ def page(alignment: Alignment, check: Check | None = None) -> str:
         rejected=_rejected(alignment, canvas),
         points=len(alignment.tie_points),
         maps=list(_maps(alignment, frame)),
-        bars=[words.bar(reason) for reason in alignment.verdict.reasons],
+        bars=words.bars(alignment),
         bands=bands,
         checked=[] if check is None else check.bands or [],
         steps=_steps(alignment),
@@ -151,8 +151,9 @@ def _cards(alignment: Alignment) -> Iterator[tuple[str, str, str]]:
     name = "Error of the candidate" if refused else "Error after"
     yield name, _px(accuracy.check_rmse_px), "RMSE at tie points that the fit had not seen"
     yield "Uncertainty", _px(accuracy.sigma_corner_px), "standard error at the worst corner"
-    if math.isfinite(accuracy.residual_rms_px):
-        yield "Residual bend", _px(accuracy.residual_rms_px), "RMS that one affine leaves"
+    bend = accuracy.residual_rms_px
+    told = "RMS that one affine leaves" if math.isfinite(bend) else "not measured"
+    yield "Residual bend", _px(bend), told
     kept = int(points.kept.sum()) or accuracy.kept
     yield "Tie points", f"{kept}", f"kept of {len(points)} tried" if len(points) else "kept"
     if math.isfinite(accuracy.coverage):

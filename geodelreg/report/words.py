@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,17 +78,20 @@ REASONS = {
         "Bands agree",
         "Distance between where two bands of MS put the ground; clouds make them differ.",
     ),
-    "keypoints_apart": ("Keypoints agree", "Distance from where distinct features put the ground."),
+    "keypoints_apart": (
+        "No surer keypoints object",
+        "Distance from where distinct features, more certain ones, put the ground; 0 without any.",
+    ),
     "max_shift": ("Shift within your limit", "As asked with --max-shift."),
     "max_rotation": ("Rotation within your limit", "As asked with --max-rotation."),
     "max_scale": ("Scale within your limit", "As asked with --max-scale."),
     "two_motions": (
         "The raster moves as one",
-        "Share of the patches that lie elsewhere together: a torn mosaic, dropped rows, clouds.",
+        "Share of the patches that lie elsewhere together and do not count as the ground's bend.",
     ),
     "local": (
         "One affine is enough",
-        "What one affine leaves of the ground's bend: relief, a moving sensor, dropped rows.",
+        "What one affine leaves of the ground's bend: relief, dropped rows, a torn mosaic.",
     ),
 }
 """Of each reason of the gate: what it asks, and what it measures."""
@@ -101,8 +104,8 @@ FAILED = {
     "sigma_px": "The correction is too uncertain at the far corner.",
     "disagreement_px": "Two halves of the tie points tell different corrections.",
     "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
-    "rival_motion": "A second part of the picture moves otherwise, and is nearly as large as the "
-    "part that was followed.",
+    "rival_motion": "Nearly as many patches agree on another motion as on the one followed: a part "
+    "that moves by itself, or a bend.",
     "support": "Too many areas look alike better elsewhere than in place.",
     "bands_apart": "The bands of MS do not lie on each other, as over clouds.",
     "keypoints_apart": "Distinct features say another place than the patches.",
@@ -113,6 +116,8 @@ FAILED = {
     "local": "One affine, and so a header, cannot follow all of the ground.",
 }
 """Of each reason of the gate: what it means that it failed."""
+_OF_THE_WHOLE = ("two_motions", "local")
+"""Reasons that are asked only of what passed the others."""
 _AT_LEAST = ("tie_points", "coverage", "support")
 _WORST = 2.0
 _WORTH_A_WORD = 0.05
@@ -132,7 +137,8 @@ class Bar:
     question, meaning, message : str
     failure : str
         What it means that it failed.
-    passed : bool
+    passed : bool or None
+        None of what was not measured.
     used : float
         How much of what is allowed is used up, 0 to 2: the limit is 1, and more has failed.
     """
@@ -141,7 +147,7 @@ class Bar:
     meaning: str
     message: str
     failure: str
-    passed: bool
+    passed: bool | None
     used: float
 
 
@@ -156,6 +162,17 @@ def bar(reason: Reason) -> Bar:
     used = min(ratio, 1.0) if reason.passed else min(max(ratio, 1.0), _WORST)
     failure = FAILED.get(reason.name, f"{question}: no.")
     return Bar(question, meaning, reason.message, failure, reason.passed, used)
+
+
+def bars(alignment: Alignment) -> list[Bar]:
+    """The bars of a verdict; what was not measured has neither passed nor failed."""
+    whole = math.isfinite(alignment.accuracy.residual_interval_px[0])
+    return [
+        bar(reason)
+        if whole or reason.name not in _OF_THE_WHOLE or reason.value
+        else replace(bar(reason), passed=None, message="not measured")
+        for reason in alignment.verdict.reasons
+    ]
 
 
 def names(paths: Sequence[str]) -> str:

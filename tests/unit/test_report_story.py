@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.report.frame import frame_of
 from geodelreg.report.places import places
 from geodelreg.report.residuals import error_map, sigma_map
-from geodelreg.report.words import bar, command, story
+from geodelreg.report.words import bar, bars, command, story
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment, Outcome, Reason, Verdict
@@ -177,6 +178,28 @@ def test_a_bar_is_beyond_the_limit_when_its_reason_failed(
     found = bar(Reason(name, value, limit, passed, ""))
     assert found.used == pytest.approx(used)
     assert (found.used <= 1.0) is passed
+
+
+@pytest.mark.parametrize("interval", [(float("nan"), float("nan")), (0.0, 0.1)])
+def test_what_was_not_measured_has_neither_passed_nor_failed(
+    interval: tuple[float, float],
+) -> None:
+    """The whole is not asked when patches agree on a rival motion; its zeros are no measure."""
+    zeros = tuple(Reason(name, 0.0, 0.5, True, "0 of") for name in ("two_motions", "local"))
+    made = bent()
+    made = replace(
+        made,
+        solution=replace(
+            made.solution,
+            verdict=Verdict(Outcome.REFUSED, REFUSED.reasons + zeros),
+            accuracy=replace(made.solution.accuracy, residual_interval_px=interval),
+        ),
+    )
+    rival, *whole = bars(made)
+    assert rival.passed is False
+    for found in whole:
+        assert found.passed is (None if np.isnan(interval[0]) else True)
+        assert ("not measured" in found.message) is bool(np.isnan(interval[0]))
 
 
 def test_the_command_has_every_option_that_was_changed() -> None:
