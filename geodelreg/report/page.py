@@ -148,8 +148,9 @@ def _cards(alignment: Alignment) -> Iterator[tuple[str, str, str]]:
     accuracy, points = alignment.accuracy, alignment.tie_points
     refused = alignment.verdict.outcome is Outcome.REFUSED
     yield "Error before", _px(accuracy.before_rmse_px), "RMSE at the kept tie points, as delivered"
-    name = "Error of the candidate" if refused else "Error after"
-    yield name, _px(accuracy.check_rmse_px), "RMSE at tie points that the fit had not seen"
+    name = "Error where it fits" if refused else "Error after"
+    whose = "of the part that the candidate follows" if refused else "that the fit had not seen"
+    yield name, _px(accuracy.check_rmse_px), f"RMSE at tie points {whose}"
     yield "Uncertainty", _px(accuracy.sigma_corner_px), "standard error at the worst corner"
     bend = accuracy.residual_rms_px
     told = "RMS that one affine leaves" if math.isfinite(bend) else "not measured"
@@ -227,7 +228,7 @@ def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
             f"{short(float(values[worst]))}, {part_of(at[worst], frame.window)}.",
             "uri": data_uri(_coloured(values / most), lossless=True),
             "legend": data_uri(_coloured(np.linspace(0.0, 1.0, 128)[None]), lossless=True),
-            "most": short(most),
+            "most": short(most) + (" or more" if values[worst] > most else ""),
             "half": short(most / 2),
         }
 

@@ -14,6 +14,7 @@ from geodelreg.judge.words import region
 from geodelreg.options import AlignOptions, flags
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import found_line, next_line, short, with_metres
+from geodelreg.report.frame import frame_of
 from geodelreg.report.residuals import elsewhere, local_residual, matched
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
@@ -86,7 +87,7 @@ REASONS = {
     "max_rotation": ("Rotation within your limit", "As asked with --max-rotation."),
     "max_scale": ("Scale within your limit", "As asked with --max-scale."),
     "two_motions": (
-        "The raster moves as one",
+        "No motion beside the bend",
         "Share of the patches that lie elsewhere together and do not count as the ground's bend.",
     ),
     "local": (
@@ -124,6 +125,7 @@ _WORTH_A_WORD = 0.05
 """Of the patches that matched: fewer lie elsewhere in any good pair."""
 _WORTH_A_WORD_SILENT = 0.3
 _MOSTLY = 0.75
+_ALL_OVER = "all over the picture"
 _TOGETHER = 0.4
 """Spread over length of displacements that are one motion."""
 
@@ -192,6 +194,8 @@ def story(alignment: Alignment, check: Check | None = None) -> list[str]:
         told = verdict_line(check).removeprefix(f"{check.source_name}: ")
     elif alignment.verdict.outcome is Outcome.REFUSED:
         told = "the images do not support this alignment. Nothing was written"
+        if alignment.tie_points.kept.any() or alignment.accuracy.kept:
+            told += f". {_candidate(alignment)}"
     else:
         told = found_line(alignment).partition(": ")[2].removesuffix(".")
     texts = [_elsewhere(alignment), _silent(alignment), _left(alignment)]
@@ -209,6 +213,17 @@ def advice(alignment: Alignment, check: Check | None = None) -> str:
     if check.outcome is CheckOutcome.MISALIGNED:
         return "Correct the header with geodelreg align."
     return "Use the raster as it is."
+
+
+def _candidate(alignment: Alignment) -> str:
+    """What was refused: where it would move MS, and by what model."""
+    frame = frame_of(alignment)
+    middle = np.array([frame.ms_size]) / 2
+    (move,) = frame.header.forward(frame.found.forward(middle)) - frame.header.forward(middle)
+    return (
+        f"The candidate that was refused moves MS at its centre {direction(move)} "
+        f"(PAN px, model {alignment.solution.model})"
+    )
 
 
 def _sentence(text: str) -> str:
@@ -244,11 +259,28 @@ def _elsewhere(alignment: Alignment) -> str:
         return ""
     off = points.residual_px[away]
     length = float(np.median(np.hypot(*off.T)))
+    where = _region(alignment, some, away)
+    if where == _ALL_OVER:
+        fits = _region(alignment, some, some & ~away)
+        where += f" (those that fit: {fits})" if fits != _ALL_OVER else ""
     return (
         f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere: "
-        f"{_region(alignment, some, away)}, {short(length)} PAN px off in the "
-        f"median, {_pattern(points, away, length)}."
+        f"{where}, {short(length)} PAN px off in the median, {_pattern(points, away, length)}."
+        f"{_edge(points.source_px[some], away[some], where)}"
     )
+
+
+def _edge(xy: FloatArray, away: BoolArray, where: str) -> str:
+    """Between which rows or columns of MS a part at one side begins; empty of other parts."""
+    side = where.split()[1]
+    if not where.startswith("the ") or away.all():
+        return ""
+    along = np.sort(xy[:, 1 if side in ("upper", "lower") else 0])
+    count = int(away.sum())
+    last = count if side in ("upper", "left") else len(along) - count
+    low, high = along[last - 1], along[last]
+    what = "rows" if side in ("upper", "lower") else "columns"
+    return f" The edge of that part lies between {what} {low:.0f} and {high:.0f} of MS."
 
 
 def _pattern(points: TiePoints, away: BoolArray, length_px: float) -> str:
@@ -282,13 +314,13 @@ def _region(alignment: Alignment, some: BoolArray, member: BoolArray) -> str:
     xy = alignment.tie_points.source_px
     sharp = region(xy[some], member[some], (float(width), float(height)))
     if sharp.startswith("the "):
-        return f"{sharp} of the picture"
+        return f"{sharp} of the patches"
     x, y = (xy[member] / (width, height)).T
     words = [_half(y, "upper", "lower"), _half(x, "left", "right")]
     where = " ".join(dict.fromkeys(word for word in words if word))
     if where in ("upper", "lower", "left", "right"):
         where += " half"
-    return f"mostly in the {where} of the picture" if where else "all over the picture"
+    return f"mostly in the {where} of the picture" if where else _ALL_OVER
 
 
 def _half(share: FloatArray, low: str, high: str) -> str:

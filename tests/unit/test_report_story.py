@@ -80,7 +80,8 @@ def cloudy() -> Alignment:
     [
         (
             torn(),
-            ("the lower 33 %", "all alike (5.0", "right and 3.0", "up), as if that part were torn"),
+            ("the lower 33 % of the patches", "between rows 50 and 56 of MS", "all alike (5.0",
+             "right and 3.0", "up), as if that part were torn"),
         ),
         (bent(), ("in directions that change gradually, as if the picture were bent",)),
         (
@@ -95,6 +96,21 @@ def test_the_story_says_what_is_wrong_and_where(made: Alignment, told: tuple[str
     text = " ".join(story(made))
     for words in told:
         assert words in text
+
+
+def test_of_misfits_all_around_the_story_says_where_it_fits() -> None:
+    """A bend's patches fit in one corner and lie elsewhere at all sides of it."""
+    x, y = lattice().T
+    away = (x < 0.55) | (y > 0.45)
+    residual = noise(0.02) + np.where(away[:, None], np.stack([3 * y, 2 * x + 1], axis=1), 0.0)
+    text = " ".join(story(alignment(tie_points=patches(residual, away), verdict=REFUSED)))
+    assert "all over the picture (those that fit: mostly in the upper right of" in text
+    assert "in the middle" not in text
+
+
+def test_a_refusal_says_what_was_refused() -> None:
+    text = " ".join(story(torn()))
+    assert "moves MS at its centre 3.00 right and 1.50 down (PAN px, model shift)" in text
 
 
 def test_the_story_of_a_good_pair_alarms_nobody() -> None:
