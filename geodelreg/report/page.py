@@ -130,7 +130,7 @@ def _closely(place: Place, look: Look) -> dict[str, Any]:
     if math.isfinite(place.distance_px):
         told = (
             f"In the {place.where}: after the correction MS lies {short(place.distance_px)} PAN px "
-            f"off ({words.direction(place.residual_px)})."
+            f"off ({words.direction(place.residual_px)}) in the median of the points there."
         )
     window = place.window
     columns = f"{window.column} to {window.column + window.width}"
@@ -214,8 +214,8 @@ def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
         ),
         (
             "How sure it is",
-            "Standard error of the correction",
-            sigma_map(frame),
+            "Standard error if the model holds (blank where the points around do not support it)",
+            sigma_map(points, frame),
         ),
     ):
         if not np.isfinite(values).any():
@@ -228,7 +228,7 @@ def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
             f"{short(float(values[worst]))}, {part_of(at[worst], frame.window)}.",
             "uri": data_uri(_coloured(values / most), lossless=True),
             "legend": data_uri(_coloured(np.linspace(0.0, 1.0, 128)[None]), lossless=True),
-            "most": short(most) + (" or more" if values[worst] > most else ""),
+            "most": short(most) + (" or more" if values[worst] > 1.005 * most else ""),
             "half": short(most / 2),
         }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from affine import Affine
 from numpy.typing import NDArray
 
+from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.options import AlignOptions
 from geodelreg.report.frame import frame_of
 from geodelreg.report.places import places
@@ -140,6 +141,38 @@ def test_the_worst_place_lies_where_the_fault_is_and_the_best_does_not() -> None
         assert row + height <= window.row + window.height
 
 
+def test_the_best_place_holds_no_gross_misfits_and_the_typical_one_is_as_the_rest() -> None:
+    x, y = lattice().T
+    residual = np.stack([0.2 + 3 * x, 0 * x], axis=1)  # more and more to the right
+    spot = np.flatnonzero((x < 0.25) & (y < 0.5))[::3]
+    residual[spot] = 15.0  # a third of the points at the upper left: their median does not show it
+    away = np.zeros(SIDE * SIDE, dtype=bool)
+    away[spot] = True
+    made = alignment(tie_points=patches(residual, away))
+    found = {place.name: place for place in places(made.tie_points, frame_of(made))}
+    assert "left" in found["best"].where
+    assert "upper" not in found["best"].where
+    assert found["typical"].distance_px == pytest.approx(1.7, abs=0.4)
+    assert found["worst"].where.endswith("right")
+
+
+def test_a_place_where_much_is_missing_is_none_of_the_three() -> None:
+    x, y = lattice().T
+    residual = noise(0.02)
+    far = (x > 0.85) & (y > 0.85)
+    residual[far] = 9.0
+    every = patches(residual, far)
+    there = ~((x > 0.45) & (y > 0.45)) | far  # no data, but for a scrap in the corner
+    given = {field.name: getattr(every, field.name)[there] for field in fields(every)}
+    made = alignment(tie_points=TiePoints(**given))
+    for place in places(made.tie_points, frame_of(made)):
+        low = np.array(place.window[:2])
+        at = every.reference_px
+        inside = ((at >= low) & (at < low + place.window[2:])).all(axis=1)
+        assert (inside & there).sum() >= (inside & ~there).sum()
+        assert place.distance_px < 1.0
+
+
 def test_the_map_of_what_is_left_is_large_where_the_fault_is() -> None:
     made = torn()
     values = error_map(made.tie_points, frame_of(made))
@@ -155,8 +188,25 @@ def test_the_map_of_what_is_left_is_large_where_the_fault_is() -> None:
     assert np.nanmax(error_map(made.tie_points, frame_of(made))) < 0.2
 
 
+def test_no_standard_error_is_shown_where_no_point_supports_the_correction() -> None:
+    def known_of(made: Alignment) -> NDArray[np.bool_]:
+        found = AffineMap(~MS_HEADER @ SHIFTED, lambda xy: np.full(len(xy), 0.01))
+        made = replace(made, solution=replace(made.solution, map=found))
+        return np.isfinite(sigma_map(made.tie_points, frame_of(made)))
+
+    known = known_of(torn())
+    assert known[5 : len(known) // 2, 5:-5].all()  # MS ends beside
+    assert not known[-len(known) // 5 :].any()
+    # nor under a cloud wider than the reach of the points around it
+    x, y = lattice().T
+    cloud = (x < 0.75) & (y < 0.75)
+    known = known_of(alignment(tie_points=patches(noise(0.02), cloud & False, cloud)))
+    assert not known[: len(known) // 4, : len(known[0]) // 4].any()
+    assert known[-len(known) // 8 :, -len(known[0]) // 8 :].any()
+
+
 def test_of_a_map_without_standard_errors_none_is_shown() -> None:
-    assert np.isnan(sigma_map(frame_of(refused()))).all()
+    assert np.isnan(sigma_map(refused().tie_points, frame_of(refused()))).all()
 
 
 def test_without_points_the_middle_is_shown() -> None:
