@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.options import AlignOptions
+from geodelreg.report.drawing import mesh
 from geodelreg.report.frame import frame_of
 from geodelreg.report.places import places
 from geodelreg.report.residuals import error_map, sigma_map
@@ -203,6 +204,15 @@ def test_no_standard_error_is_shown_where_no_point_supports_the_correction() -> 
     known = known_of(alignment(tie_points=patches(noise(0.02), cloud & False, cloud)))
     assert not known[: len(known) // 4, : len(known[0]) // 4].any()
     assert known[-len(known) // 8 :, -len(known[0]) // 8 :].any()
+
+
+def test_the_mesh_bridges_no_gap() -> None:
+    x = lattice()[:, 0]
+    cloud = (x > 0.2) & (x < 0.8)
+    points = patches(noise(0.02), cloud & False, cloud)
+    sides = points.source_px[mesh(points), 0]
+    assert len(sides) == 2 * 2 * 2 * (SIDE - 1)  # two strips, three columns of points each
+    assert (np.ptp(sides, axis=1) < 20).all()
 
 
 def test_of_a_map_without_standard_errors_none_is_shown() -> None:
