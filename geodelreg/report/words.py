@@ -79,6 +79,9 @@ REASONS = {
         "Bands agree",
         "Distance between where two bands of MS put the ground; clouds make them differ.",
     ),
+    "bands": ("Bands lie together", "Distance between bands of MS that other bands confirm."),
+    "strain": ("The field folds nothing", "Largest strain of the field."),
+    "field_points": ("Enough points for a field", "A field on few points bends between them."),
     "keypoints_apart": (
         "No surer keypoints object",
         "Distance from where distinct features, more certain ones, put the ground; 0 without any.",
@@ -109,6 +112,9 @@ FAILED = {
     "that moves by itself, or a bend.",
     "support": "Too many areas look alike better elsewhere than in place.",
     "bands_apart": "The bands of MS do not lie on each other, as over clouds.",
+    "bands": "No one correction is right for all bands of MS.",
+    "strain": "The field is so steep somewhere that it would fold the ground.",
+    "field_points": "Too few points are left to follow a bend.",
     "keypoints_apart": "Distinct features say another place than the patches.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",
@@ -119,7 +125,7 @@ FAILED = {
 """Of each reason of the gate: what it means that it failed."""
 _OF_THE_WHOLE = ("two_motions", "local")
 """Reasons that are asked only of what passed the others."""
-_AT_LEAST = ("tie_points", "coverage", "support")
+_AT_LEAST = ("tie_points", "coverage", "support", "field_points")
 _WORST = 2.0
 _WORTH_A_WORD = 0.05
 """Of the patches that matched: fewer lie elsewhere in any good pair."""

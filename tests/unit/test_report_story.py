@@ -11,6 +11,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.judge.verdict import Evidence, judge, too_few_for_a_field
 from geodelreg.options import AlignOptions
 from geodelreg.report.drawing import mesh
 from geodelreg.report.frame import frame_of
@@ -276,6 +277,18 @@ def test_what_was_not_measured_has_neither_passed_nor_failed(
     for found in whole:
         assert found.passed is (None if np.isnan(interval[0]) else True)
         assert ("not measured" in found.message) is bool(np.isnan(interval[0]))
+
+
+def test_each_reason_of_the_gate_has_its_words() -> None:
+    kinds = {"words": "", "bands_words": ""}
+    unknown = {field.name: kinds.get(field.name, float("nan")) for field in fields(Evidence)}
+    limits = AlignOptions(max_shift_px=1.0, max_rotation_deg=1.0, max_scale=1.1, on_local="refuse")
+    reasons = (*judge(Evidence(**unknown), limits), too_few_for_a_field(5))  # type: ignore[arg-type]
+    assert {"strain", "bands", "local", "max_shift"} <= {reason.name for reason in reasons}
+    for found in map(bar, reasons):
+        assert found.passed is False
+        assert found.meaning
+        assert not found.failure.endswith(": no.")
 
 
 def test_the_command_has_every_option_that_was_changed() -> None:
