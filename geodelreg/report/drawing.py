@@ -20,6 +20,8 @@ _SHORT_PX = 0.25
 _LARGE_PERCENT = 95
 _LONGEST = 3.0
 """Times `_LONG_SHARE`: where arrows of gross mismatches are cut off."""
+_GAP = 3.0
+"""Times the usual longest side of a triangle: a longer one bridges a gap."""
 _HEAD = 0.35
 _MOST_HEAD = 7.0
 
@@ -138,9 +140,17 @@ def marks(at: FloatArray, shape: str) -> str:
 
 
 def mesh(points: TiePoints) -> IntArray:
-    """(T, 3) Delaunay triangles of the kept points, as indices into all points."""
+    """(T, 3) Delaunay triangles of the kept points, as indices into all points.
+
+    Those over gaps, as clouds leave them, are left out: nothing is known between their corners.
+    """
     kept = np.flatnonzero(points.kept)
-    return np.asarray(kept[delaunay(points.source_px[kept])], dtype=np.intp).reshape(-1, 3)
+    triangles = np.asarray(kept[delaunay(points.source_px[kept])], dtype=np.intp).reshape(-1, 3)
+    if not len(triangles):
+        return triangles
+    corners = points.source_px[triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    return np.asarray(triangles[longest <= _GAP * np.median(longest)])
 
 
 def mesh_path(points: TiePoints, canvas: Canvas) -> str:

@@ -111,7 +111,7 @@ def _draw_error(figure: Figure, alignment: Alignment, canvas: Canvas, image: Flo
     frame = frame_of(alignment)
     maps = {
         "What is left (PAN px)": error_map(alignment.tie_points, frame),
-        "Standard error of the correction (PAN px)": sigma_map(frame),
+        "Standard error of the correction (PAN px)": sigma_map(alignment.tie_points, frame),
     }
     height, width = canvas.shape
     for axes, (title, values) in zip(figure.subplots(1, 2), maps.items(), strict=True):

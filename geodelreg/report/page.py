@@ -102,7 +102,7 @@ def page(alignment: Alignment, check: Check | None = None) -> str:
         rejected=_rejected(alignment, canvas),
         points=len(alignment.tie_points),
         maps=list(_maps(alignment, frame)),
-        bars=[words.bar(reason) for reason in alignment.verdict.reasons],
+        bars=words.bars(alignment),
         bands=bands,
         checked=[] if check is None else check.bands or [],
         steps=_steps(alignment),
@@ -130,7 +130,7 @@ def _closely(place: Place, look: Look) -> dict[str, Any]:
     if math.isfinite(place.distance_px):
         told = (
             f"In the {place.where}: after the correction MS lies {short(place.distance_px)} PAN px "
-            f"off ({words.direction(place.residual_px)})."
+            f"off ({words.direction(place.residual_px)}) in the median of the points there."
         )
     window = place.window
     columns = f"{window.column} to {window.column + window.width}"
@@ -148,11 +148,13 @@ def _cards(alignment: Alignment) -> Iterator[tuple[str, str, str]]:
     accuracy, points = alignment.accuracy, alignment.tie_points
     refused = alignment.verdict.outcome is Outcome.REFUSED
     yield "Error before", _px(accuracy.before_rmse_px), "RMSE at the kept tie points, as delivered"
-    name = "Error of the candidate" if refused else "Error after"
-    yield name, _px(accuracy.check_rmse_px), "RMSE at tie points that the fit had not seen"
+    name = "Error where it fits" if refused else "Error after"
+    whose = "of the part that the candidate follows" if refused else "that the fit had not seen"
+    yield name, _px(accuracy.check_rmse_px), f"RMSE at tie points {whose}"
     yield "Uncertainty", _px(accuracy.sigma_corner_px), "standard error at the worst corner"
-    if math.isfinite(accuracy.residual_rms_px):
-        yield "Residual bend", _px(accuracy.residual_rms_px), "RMS that one affine leaves"
+    bend = accuracy.residual_rms_px
+    told = "RMS that one affine leaves" if math.isfinite(bend) else "not measured"
+    yield "Residual bend", _px(bend), told
     kept = int(points.kept.sum()) or accuracy.kept
     yield "Tie points", f"{kept}", f"kept of {len(points)} tried" if len(points) else "kept"
     if math.isfinite(accuracy.coverage):
@@ -172,9 +174,9 @@ def _arrows(alignment: Alignment, canvas: Canvas) -> dict[str, Any]:
         "away_count": int((~found.kept).sum()),
         "key": f"{found.key_px:g} PAN px",
         "key_path": drawing.arrow_path(
-            np.array([[4.0, 10.0]]), np.array([[4.0 + found.key_length, 10.0]])
+            np.array([[0.0, 10.0]]), np.array([[found.key_length, 10.0]])
         ),
-        "key_length": found.key_length + 12,
+        "key_length": found.key_length,
         "magnified": short(found.magnified),
     }
 
@@ -212,8 +214,8 @@ def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
         ),
         (
             "How sure it is",
-            "Standard error of the correction",
-            sigma_map(frame),
+            "Standard error if the model holds (blank where the points around do not support it)",
+            sigma_map(points, frame),
         ),
     ):
         if not np.isfinite(values).any():
@@ -226,7 +228,7 @@ def _maps(alignment: Alignment, frame: Frame) -> Iterator[dict[str, Any]]:
             f"{short(float(values[worst]))}, {part_of(at[worst], frame.window)}.",
             "uri": data_uri(_coloured(values / most), lossless=True),
             "legend": data_uri(_coloured(np.linspace(0.0, 1.0, 128)[None]), lossless=True),
-            "most": short(most),
+            "most": short(most) + (" or more" if values[worst] > 1.005 * most else ""),
             "half": short(most / 2),
         }
 

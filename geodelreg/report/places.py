@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.report.drawing import spread
 from geodelreg.report.frame import Frame
-from geodelreg.report.residuals import local_residual, matched
+from geodelreg.report.residuals import matched
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray, Window
 
@@ -16,6 +17,11 @@ _SIDE_PX = 384
 _LEAST_SIDE_PX = 48
 _SHARE = 0.3
 """Of the shorter side of the common ground: small rasters have small places."""
+
+_MOST_ASKED = 400
+"""Points around which places are thought of."""
+_FULL = 0.5
+"""Of the most patches in a place, and of the usual number that matched: fewer tell too little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +35,7 @@ class Place:
     window : Window
         Of PAN.
     residual_px : (float, float)
-        What the correction leaves there, right and down; NaN when not known.
+        Median of what the correction leaves there, right and down; NaN when not known.
     where : str
         In words.
     """
@@ -46,7 +52,10 @@ class Place:
 
 
 def places(points: TiePoints, frame: Frame) -> list[Place]:
-    """The worst place among all that matched; the typical and the best of those that were kept.
+    """The worst, a typical and the best place, by what all points say that matched in each.
+
+    Places with few patches, where much is missing, or that few of the patches matched in, are none
+    of them where there are others.  The typical one has the median of their residuals.
 
     Parameters
     ----------
@@ -56,21 +65,28 @@ def places(points: TiePoints, frame: Frame) -> list[Place]:
     window = frame.window
     some = np.flatnonzero(matched(points) & _within(points.reference_px, window))
     if not len(some):
-        middle = np.array([window.column + window.width / 2, window.row + window.height / 2])
-        return [_place("middle", middle, (float("nan"), float("nan")), frame)]
-    residual, _ = local_residual(points, points.reference_px[some])
+        part = _window(_middle(window), frame)
+        return [Place("middle", part, (float("nan"), float("nan")), part_of(_middle(part), window))]
+    asked = spread(points.reference_px, some, _MOST_ASKED)
+    windows = [_window(at, frame) for at in points.reference_px[asked]]
+    tried = np.array([_within(points.reference_px, part).sum() for part in windows])
+    inside = [some[_within(points.reference_px[some], part)] for part in windows]
+    heard = np.array([len(index) for index in inside])
+    residual = np.array([np.median(points.residual_px[index], axis=0) for index in inside])
     length = np.hypot(*residual.T)
-    kept = np.flatnonzero(points.kept[some])
-    good = kept if len(kept) else np.arange(len(some))
-    order = good[np.argsort(length[good], kind="stable")]
+    spoilt = np.array([np.hypot(*points.residual_px[index].T).mean() for index in inside])
+    full = (tried >= _FULL * tried.max()) & (heard >= _FULL * np.median(heard))
+    able = np.flatnonzero(full) if full.any() else np.arange(len(windows))
+    median = np.sort(length[able])[(len(able) - 1) // 2]
+    good = able[length[able] <= median]
     chosen = {
-        "worst": int(np.argmax(length)),
-        "typical": int(order[len(order) // 2]),
-        "best": int(order[0]),
+        "worst": able[np.argmax(length[able])],
+        "typical": able[np.argmin(np.abs(length[able] - median))],
+        "best": good[np.argmin(spoilt[good])],
     }
     return [
-        _place(name, points.reference_px[some[i]], (float(residual[i, 0]), float(residual[i, 1])),
-               frame)
+        Place(name, windows[i], (float(residual[i, 0]), float(residual[i, 1])),
+              part_of(_middle(windows[i]), window))
         for name, i in chosen.items()
     ]  # fmt: skip
 
@@ -80,7 +96,8 @@ def _within(xy: FloatArray, window: Window) -> np.ndarray:
     return np.asarray(((xy >= low) & (xy < low + np.array(window[2:]))).all(axis=1))
 
 
-def _place(name: str, at: FloatArray, residual: tuple[float, float], frame: Frame) -> Place:
+def _window(at: FloatArray, frame: Frame) -> Window:
+    """The place around a point, moved until it lies in the frame."""
     whole = frame.window
     side = min(_SIDE_PX, max(_LEAST_SIDE_PX, round(_SHARE * min(whole.width, whole.height))))
     size = min(side, whole.width), min(side, whole.height)
@@ -88,7 +105,11 @@ def _place(name: str, at: FloatArray, residual: tuple[float, float], frame: Fram
         int(np.clip(round(float(c) - s / 2), start, start + full - s))
         for c, s, start, full in zip(at, size, whole[:2], whole[2:], strict=True)
     )
-    return Place(name, Window(column, row, *size), residual, part_of(at, whole))
+    return Window(column, row, *size)
+
+
+def _middle(window: Window) -> FloatArray:
+    return np.array([window.column + window.width / 2, window.row + window.height / 2])
 
 
 def part_of(at: FloatArray, window: Window) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from geodelreg.fine.layers import ELSEWHERE
 from geodelreg.report.frame import Frame
 from geodelreg.values.points import TiePoints
-from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 NEIGHBOURS = 8
 """Points whose median is taken: three gross mismatches among them change little."""
@@ -47,14 +47,19 @@ def local_residual(points: TiePoints, at: FloatArray) -> tuple[FloatArray, Float
     distance_px : (N,) float64
         To the farthest of the points asked.
     """
+    near, distance = _neighbours(points, at)
+    return np.asarray(np.median(points.residual_px[near], axis=1)), distance
+
+
+def _neighbours(points: TiePoints, at: FloatArray) -> tuple[IntArray, FloatArray]:
+    """(N, K) the matched points nearest to some places, and (N,) how far the farthest is."""
     from scipy.spatial import cKDTree
 
     some = np.flatnonzero(matched(points))
     count = min(NEIGHBOURS, len(some))
     distance, index = cKDTree(points.reference_px[some]).query(at, count)
     near = some[np.reshape(index, (len(at), count))]
-    median = np.median(points.residual_px[near], axis=1)
-    return np.asarray(median), np.reshape(distance, (len(at), count))[:, -1]
+    return np.asarray(near), np.reshape(distance, (len(at), count))[:, -1]
 
 
 def cells(frame: Frame) -> FloatArray:
@@ -76,15 +81,16 @@ def error_map(points: TiePoints, frame: Frame) -> FloatArray:
         return np.full(at.shape[:2], np.nan)
     flat = at.reshape(-1, 2)
     residual, reach = local_residual(points, flat)
-    usual = np.median(local_residual(points, points.reference_px[matched(points)])[1])
-    length = np.where(reach <= _REACH * usual, np.hypot(*residual.T), np.nan)
+    length = np.where(reach <= _reach_px(points), np.hypot(*residual.T), np.nan)
     return np.asarray(_on_ms(length, flat, frame).reshape(at.shape[:2]))
 
 
-def sigma_map(frame: Frame) -> FloatArray:
-    """(n, m) standard error of the correction in each cell, PAN pixels; NaN beyond MS.
+def sigma_map(points: TiePoints, frame: Frame) -> FloatArray:
+    """(n, m) standard error of the correction in each cell, PAN pixels.
 
-    NaN everywhere of a map that has none: it is not known then, and not 0.
+    NaN beyond MS, and where most points around lie elsewhere or none are near: the standard error
+    is of a model that nothing supports there.  NaN everywhere of a map that has no standard errors:
+    they are not known then, and not 0.  Of points that are not listed nothing is asked.
     """
     at = cells(frame)
     if not frame.sigma.values.any():
@@ -92,7 +98,17 @@ def sigma_map(frame: Frame) -> FloatArray:
     flat = at.reshape(-1, 2)
     there = np.nan_to_num(frame.to_ms(flat, corrected=True))
     sigma = frame.sigma(there) * frame.pan_px_per_ms_px
+    if matched(points).any():
+        near, reach = _neighbours(points, flat)
+        fits = points.kept[near].mean(axis=1) >= 0.5
+        sigma = np.where(fits & (reach <= _reach_px(points)), sigma, np.nan)
     return np.asarray(_on_ms(sigma, flat, frame).reshape(at.shape[:2]))
+
+
+def _reach_px(points: TiePoints) -> float:
+    """How far points may lie from a place that they speak for, PAN pixels."""
+    at = points.reference_px[matched(points)]
+    return _REACH * float(np.median(_neighbours(points, at)[1]))
 
 
 def _on_ms(values: FloatArray, at: FloatArray, frame: Frame) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from geodelreg.judge.words import region
 from geodelreg.options import AlignOptions, flags
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import found_line, next_line, short, with_metres
+from geodelreg.report.frame import frame_of
 from geodelreg.report.residuals import elsewhere, local_residual, matched
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
@@ -78,17 +79,23 @@ REASONS = {
         "Bands agree",
         "Distance between where two bands of MS put the ground; clouds make them differ.",
     ),
-    "keypoints_apart": ("Keypoints agree", "Distance from where distinct features put the ground."),
+    "bands": ("Bands lie together", "Distance between bands of MS that other bands confirm."),
+    "strain": ("The field folds nothing", "Largest strain of the field."),
+    "field_points": ("Enough points for a field", "A field on few points bends between them."),
+    "keypoints_apart": (
+        "No surer keypoints object",
+        "Distance from where distinct features, more certain ones, put the ground; 0 without any.",
+    ),
     "max_shift": ("Shift within your limit", "As asked with --max-shift."),
     "max_rotation": ("Rotation within your limit", "As asked with --max-rotation."),
     "max_scale": ("Scale within your limit", "As asked with --max-scale."),
     "two_motions": (
-        "The raster moves as one",
-        "Share of the patches that lie elsewhere together: a torn mosaic, dropped rows, clouds.",
+        "No motion beside the bend",
+        "Share of the patches that lie elsewhere together and do not count as the ground's bend.",
     ),
     "local": (
         "One affine is enough",
-        "What one affine leaves of the ground's bend: relief, a moving sensor, dropped rows.",
+        "What one affine leaves of the ground's bend: relief, dropped rows, a torn mosaic.",
     ),
 }
 """Of each reason of the gate: what it asks, and what it measures."""
@@ -101,10 +108,13 @@ FAILED = {
     "sigma_px": "The correction is too uncertain at the far corner.",
     "disagreement_px": "Two halves of the tie points tell different corrections.",
     "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
-    "rival_motion": "A second part of the picture moves otherwise, and is nearly as large as the "
-    "part that was followed.",
+    "rival_motion": "Nearly as many patches agree on another motion as on the one followed: a part "
+    "that moves by itself, or a bend.",
     "support": "Too many areas look alike better elsewhere than in place.",
     "bands_apart": "The bands of MS do not lie on each other, as over clouds.",
+    "bands": "No one correction is right for all bands of MS.",
+    "strain": "The field is so steep somewhere that it would fold the ground.",
+    "field_points": "Too few points are left to follow a bend.",
     "keypoints_apart": "Distinct features say another place than the patches.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",
@@ -113,12 +123,15 @@ FAILED = {
     "local": "One affine, and so a header, cannot follow all of the ground.",
 }
 """Of each reason of the gate: what it means that it failed."""
-_AT_LEAST = ("tie_points", "coverage", "support")
+_OF_THE_WHOLE = ("two_motions", "local")
+"""Reasons that are asked only of what passed the others."""
+_AT_LEAST = ("tie_points", "coverage", "support", "field_points")
 _WORST = 2.0
 _WORTH_A_WORD = 0.05
 """Of the patches that matched: fewer lie elsewhere in any good pair."""
 _WORTH_A_WORD_SILENT = 0.3
 _MOSTLY = 0.75
+_ALL_OVER = "all over the picture"
 _TOGETHER = 0.4
 """Spread over length of displacements that are one motion."""
 
@@ -132,7 +145,8 @@ class Bar:
     question, meaning, message : str
     failure : str
         What it means that it failed.
-    passed : bool
+    passed : bool or None
+        None of what was not measured.
     used : float
         How much of what is allowed is used up, 0 to 2: the limit is 1, and more has failed.
     """
@@ -141,7 +155,7 @@ class Bar:
     meaning: str
     message: str
     failure: str
-    passed: bool
+    passed: bool | None
     used: float
 
 
@@ -156,6 +170,17 @@ def bar(reason: Reason) -> Bar:
     used = min(ratio, 1.0) if reason.passed else min(max(ratio, 1.0), _WORST)
     failure = FAILED.get(reason.name, f"{question}: no.")
     return Bar(question, meaning, reason.message, failure, reason.passed, used)
+
+
+def bars(alignment: Alignment) -> list[Bar]:
+    """The bars of a verdict; what was not measured has neither passed nor failed."""
+    whole = math.isfinite(alignment.accuracy.residual_interval_px[0])
+    return [
+        bar(reason)
+        if whole or reason.name not in _OF_THE_WHOLE or reason.value
+        else replace(bar(reason), passed=None, message="not measured")
+        for reason in alignment.verdict.reasons
+    ]
 
 
 def names(paths: Sequence[str]) -> str:
@@ -175,6 +200,8 @@ def story(alignment: Alignment, check: Check | None = None) -> list[str]:
         told = verdict_line(check).removeprefix(f"{check.source_name}: ")
     elif alignment.verdict.outcome is Outcome.REFUSED:
         told = "the images do not support this alignment. Nothing was written"
+        if alignment.tie_points.kept.any() or alignment.accuracy.kept:
+            told += f". {_candidate(alignment)}"
     else:
         told = found_line(alignment).partition(": ")[2].removesuffix(".")
     texts = [_elsewhere(alignment), _silent(alignment), _left(alignment)]
@@ -192,6 +219,17 @@ def advice(alignment: Alignment, check: Check | None = None) -> str:
     if check.outcome is CheckOutcome.MISALIGNED:
         return "Correct the header with geodelreg align."
     return "Use the raster as it is."
+
+
+def _candidate(alignment: Alignment) -> str:
+    """What was refused: where it would move MS, and by what model."""
+    frame = frame_of(alignment)
+    middle = np.array([frame.ms_size]) / 2
+    (move,) = frame.header.forward(frame.found.forward(middle)) - frame.header.forward(middle)
+    return (
+        f"The candidate that was refused moves MS at its centre {direction(move)} "
+        f"(PAN px, model {alignment.solution.model})"
+    )
 
 
 def _sentence(text: str) -> str:
@@ -227,11 +265,28 @@ def _elsewhere(alignment: Alignment) -> str:
         return ""
     off = points.residual_px[away]
     length = float(np.median(np.hypot(*off.T)))
+    where = _region(alignment, some, away)
+    if where == _ALL_OVER:
+        fits = _region(alignment, some, some & ~away)
+        where += f" (those that fit: {fits})" if fits != _ALL_OVER else ""
     return (
         f"{int(away.sum())} of {int(some.sum())} patches that matched lie elsewhere: "
-        f"{_region(alignment, some, away)}, {short(length)} PAN px off in the "
-        f"median, {_pattern(points, away, length)}."
+        f"{where}, {short(length)} PAN px off in the median, {_pattern(points, away, length)}."
+        f"{_edge(points.source_px[some], away[some], where)}"
     )
+
+
+def _edge(xy: FloatArray, away: BoolArray, where: str) -> str:
+    """Between which rows or columns of MS a part at one side begins; empty of other parts."""
+    side = where.split()[1]
+    if not where.startswith("the ") or away.all():
+        return ""
+    along = np.sort(xy[:, 1 if side in ("upper", "lower") else 0])
+    count = int(away.sum())
+    last = count if side in ("upper", "left") else len(along) - count
+    low, high = along[last - 1], along[last]
+    what = "rows" if side in ("upper", "lower") else "columns"
+    return f" The edge of that part lies between {what} {low:.0f} and {high:.0f} of MS."
 
 
 def _pattern(points: TiePoints, away: BoolArray, length_px: float) -> str:
@@ -265,13 +320,13 @@ def _region(alignment: Alignment, some: BoolArray, member: BoolArray) -> str:
     xy = alignment.tie_points.source_px
     sharp = region(xy[some], member[some], (float(width), float(height)))
     if sharp.startswith("the "):
-        return f"{sharp} of the picture"
+        return f"{sharp} of the patches"
     x, y = (xy[member] / (width, height)).T
     words = [_half(y, "upper", "lower"), _half(x, "left", "right")]
     where = " ".join(dict.fromkeys(word for word in words if word))
     if where in ("upper", "lower", "left", "right"):
         where += " half"
-    return f"mostly in the {where} of the picture" if where else "all over the picture"
+    return f"mostly in the {where} of the picture" if where else _ALL_OVER
 
 
 def _half(share: FloatArray, low: str, high: str) -> str:

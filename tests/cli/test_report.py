@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -70,6 +72,27 @@ def test_the_page_says_what_the_report_says(made: Path) -> None:
     for version in report["versions"].values():
         assert version in page.text
     assert "geodelreg align ms.tif pan.tif --dry-run --report again.html" in page.text
+
+
+def test_the_arrow_of_the_key_is_as_long_as_one_of_the_picture(made: Path) -> None:
+    """Both as shares of the figure's width, which is the picture's and the key's."""
+    page, report = Page(made / "good.html"), json.loads((made / "good.json").read_text())
+    line = re.compile(r"M([-\d.]+) ([-\d.]+)L([-\d.]+) ([-\d.]+)")
+
+    def shafts(path: str) -> list[float]:
+        ends = (map(float, found) for found in line.findall(path))
+        return [math.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in ends]
+
+    (key,) = page.all("svg", **{"class": "measure"})
+    paths = [a for tag, a in page.elements if tag == "path" and "line kept" in a.get("class", "")]
+    width = float(page.all("svg", **{"class": "picture"})[0]["viewbox"].split()[2])
+    key_width = float(key["viewbox"].split()[2])
+    shown = float(key["width"].removesuffix("%")) / 100 * max(shafts(paths[1]["d"])) / key_width
+    (told,) = re.findall(r"([\d.]+) PAN px (?:\d+ kept)", page.text)
+    residuals = [p["residual_px"] for p in report["tie_points"]["points"] if p["status"] == "kept"]
+    lengths = [math.hypot(*residual) for residual in residuals]
+    drawn = max(shafts(paths[0]["d"])) / width
+    assert shown / float(told) == pytest.approx(drawn / max(lengths), rel=0.02)
 
 
 def test_a_refusal_has_its_page_with_the_reasons_and_the_candidate(made: Path) -> None:
