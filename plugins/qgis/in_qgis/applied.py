@@ -14,7 +14,7 @@ def applied(folder: Path) -> None:
     import processing
 
     raster = QgsRasterLayer(str(folder / "band 3.tif"), "Band")
-    gpkg = folder / "Zwei Tabellen.gpkg"
+    gpkg = folder / "Wege 2.gpkg"
     shutil.copy(folder / "Wege.gpkg", gpkg)
     layer = QgsVectorLayer(f"{gpkg}|layername=Wege", "Wege", "ogr")
     assert layer.isValid()
