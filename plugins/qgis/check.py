@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio.raw
 import rasterio
 from affine import Affine
 
@@ -81,10 +84,14 @@ def qgis_process(home: Path, *words: str, command: bool = True) -> subprocess.Co
 
 
 def run_algorithm(
-    home: Path, name: str, parameters: Mapping[str, Path], command: bool = True
+    home: Path, name: str, parameters: Mapping[str, object], command: bool = True
 ) -> str:
-    """Run an algorithm in ``qgis_process``; what it prints."""
-    words = [f"{key}={value}" for key, value in parameters.items()]
+    """Run an algorithm in ``qgis_process``; what it prints.  A list is given one by one."""
+    words = [
+        f"{key}={value}"
+        for key, values in parameters.items()
+        for value in (values if isinstance(values, list) else [values])
+    ]
     done = qgis_process(home, "run", f"geodelreg:{name}", "--", *words, command=command)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -139,6 +146,76 @@ def same_bytes(home: Path, folder: Path) -> None:
                 print(f"ok: {name}: {mine.name}, {mine.stat().st_size} bytes, all the same")
 
 
+def make_vectors(folder: Path) -> tuple[Path, Path]:
+    """Three points of the sample as GeoJSON and as GeoPackage."""
+    geojson, gpkg = folder / "Äcker.geojson", folder / "Wege.gpkg"
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": f"Ort {number}"},
+            "geometry": {"type": "Point", "coordinates": [-75.68 + 0.002 * number, 37.69]},
+        }
+        for number in range(3)
+    ]
+    geojson.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    about, _, places, columns = pyogrio.raw.read(geojson)
+    kind = about["geometry_type"]
+    pyogrio.raw.write(
+        gpkg, places, columns, about["fields"], crs=about["crs"], geometry_type=kind, driver="GPKG"
+    )
+    return geojson, gpkg
+
+
+def without_date(gpkg: Path) -> str:
+    """All tables of a GeoPackage but for the moment of its last change."""
+    with sqlite3.connect(gpkg) as base:
+        return re.sub(r"\d{4}-\d\d-\d\dT[\d:.]+Z", "", "\n".join(base.iterdump()))
+
+
+def same_corrections(home: Path, folder: Path) -> None:
+    """What QGIS makes of a correction is what the command line makes of it."""
+    raster, vectors = folder / "band 2.tif", make_vectors(folder)
+    here, there = folder / "applied", folder / "cli" / "applied"
+    for place in (here, there):
+        place.mkdir()
+        shutil.copy(raster, place / "in place.tif")
+    warp = {"WARP": "true", "WARP_GRID": "pan", "RESAMPLING": "nearest"}
+    for keys, words in (
+        ({"OUTPUT": here / "one.tif"}, [raster, "-o", there / "one.tif"]),
+        (
+            {"OUTPUT": here / "warped.tif", **warp},
+            [raster, "-o", there / "warped.tif", "--warp", "--grid", "pan", "-r", "nearest"],
+        ),
+        ({"INPUT": vectors[0], "FOLDER": here / "1"}, [vectors[0], "-o", there / vectors[0].name]),
+        (
+            {"INPUT": [raster, *vectors], "FOLDER": here / "3"},
+            [raster, *vectors, "-o", there / "3"],
+        ),
+        (
+            {"INPUT": here / "in place.tif", "IN_PLACE": "true"},
+            [there / "in place.tif", "--in-place"],
+        ),
+    ):
+        run_algorithm(home, "apply", {"CORRECTION": folder / "a.json", "INPUT": raster, **keys})
+        geodelreg("apply", folder / "a.json", *words)
+    shutil.move(here / "1" / vectors[0].name, here)
+    # QGIS leaves statistics (.aux.xml) beside what it opens
+    made, wanted = (
+        {file.relative_to(place): file for file in place.rglob("*.*") if file.suffix != ".xml"}
+        for place in (here, there)
+    )
+    assert made.keys() == wanted.keys()
+    for name, mine in sorted(made.items()):
+        theirs = wanted[name]
+        if mine.suffix == ".gpkg":
+            assert without_date(mine) == without_date(theirs) != without_date(vectors[1])
+            print(f"ok: apply: {name}, all tables the same but for last_change")
+        else:
+            assert mine.read_bytes() == theirs.read_bytes()
+            assert mine.read_bytes() not in (raster.read_bytes(), vectors[0].read_bytes())
+            print(f"ok: apply: {name}, {mine.stat().st_size} bytes, all the same")
+
+
 def install(home: Path, folder: Path) -> None:
     """Without a command: told so; then the environment is made, and aligns to the same bytes."""
     target = folder / "installed.tif"
@@ -172,6 +249,7 @@ def main(arguments: list[str]) -> None:
         qgis_process(home, "plugins", "enable", "geodelreg_qgis")
         print(version)
         same_bytes(home, folder)
+        same_corrections(home, folder)
         # not where it lies: there, the plugin's sources would come before the unpacked zip
         inside = shutil.copytree(Path(__file__).with_name("in_qgis"), home / "in_qgis")
         subprocess.run([PYTHON, inside, str(folder)], env=environment(home, True), check=True)

@@ -41,6 +41,7 @@ HERE = Path(__file__).parent
 KNOWN = load_commands(HERE / "commands.json")
 
 MS, MORE, PAN, MASK, MASK_HIDES, PAN_MASK = "MS", "MORE", "PAN", "MASK", "MASK_HIDES", "PAN_MASK"
+INPUT = "INPUT"
 _BANDS_OF = {"band": MS, "pan_band": PAN}
 _NUMBERS = {
     "integer": QgsProcessingParameterNumber.Type.Integer,
@@ -190,12 +191,14 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
         )
         self.addParameter(QgsProcessingParameterRasterLayer(PAN, "PAN (panchromatic)"))
 
-    def add_options(self) -> None:
+    def add_options(self, masks: bool = True) -> None:
         """Parameters for the options of the command, and for masks where it takes some."""
         options = self.described().options
         for option in options:
             parameter = helped(self._parameter(option), option.help)
             self.addParameter(folded(parameter) if option.advanced else parameter)
+        if not masks:
+            return
         any_layer = QgsProcessing.SourceType.TypeMapLayer
         for name, of in ((MASK, "MS"), (PAN_MASK, "PAN")):
             self.addParameter(
@@ -284,7 +287,7 @@ class GeodelregAlgorithm(QgsProcessingAlgorithm):
         """
         found = {}
         try:
-            for name in (MS, MORE, PAN, MASK, PAN_MASK):
+            for name in (MS, MORE, PAN, MASK, PAN_MASK, INPUT):
                 layers = self._layers(name, parameters, context)
                 found[name] = [file_of(source_of(layer)) for layer in layers]
             check_pair([*found[MS], *found[MORE]], found[PAN])

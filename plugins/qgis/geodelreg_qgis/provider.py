@@ -10,6 +10,7 @@ from qgis.core import QgsProcessingProvider
 from qgis.PyQt.QtGui import QIcon
 
 from geodelreg_qgis.align import Align, AlignBands
+from geodelreg_qgis.apply import Apply
 from geodelreg_qgis.base import COMMAND_SETTING
 from geodelreg_qgis.batch import Batch
 from geodelreg_qgis.check import Check
@@ -17,7 +18,7 @@ from geodelreg_qgis.command import CommandError, commands_of, find_command
 from geodelreg_qgis.install import Install
 from geodelreg_qgis.pansharpen import Pansharpen
 
-ALGORITHMS = (Align, AlignBands, Check, Pansharpen, Batch, Install)
+ALGORITHMS = (Align, AlignBands, Apply, Check, Pansharpen, Batch, Install)
 
 
 class Provider(QgsProcessingProvider):

@@ -9,6 +9,7 @@ import os
 import sys
 from pathlib import Path
 
+from applied import applied, applied_in_place, not_applied
 from qgis.core import (
     QgsApplication,
 )
@@ -31,6 +32,7 @@ def main(folder: Path) -> None:
     plugin.initProcessing()
     for step in (
         *(align, looked_only, bands_and_masks, loaded, model, batch_mode, batch_algorithm),
+        *(applied, applied_in_place, not_applied),
         *(refusals, commands, cancel, cancel_batch),
     ):
         step(folder)
