@@ -16,7 +16,7 @@ from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import HeaderError, Scene, SceneSpec, make_scene, write_scene
 from benchmarks.scenes.truth import check_points
 from geodelreg import AlignOptions
-from geodelreg.image.fill import undeclared_fill
+from geodelreg.image.reader import open_raster
 
 SPEC = SceneSpec("filled", "", HeaderError((5.3, -4.7)), (500, 500), (230, 230), ratio=2.0)
 
@@ -87,5 +87,8 @@ def test_fill_is_a_constant_corner_of_all_bands(
         data[:] = fill
     elif corner != "none":
         data[: 1 if corner == "one band" else 2, *window] = fill
-    with rasterio.open(write(tmp_path / "a.tif", data)) as dataset:
-        assert undeclared_fill(dataset, (1, 2)) == expected
+    place = {"crs": "EPSG:32618", "transform": rasterio.Affine(10, 0, 4e5, 0, -10, 4e6)}
+    with open_raster(write(tmp_path / "a.tif", data, **place)) as reader:
+        told = reader.leave_out(None)
+    assert bool(told) == (expected is not None)
+    assert told == "" or f"filled with {expected:g}" in told
