@@ -146,9 +146,10 @@ def same_bytes(home: Path, folder: Path) -> None:
                 print(f"ok: {name}: {mine.name}, {mine.stat().st_size} bytes, all the same")
 
 
-def make_vectors(folder: Path) -> tuple[Path, Path]:
-    """Three points of the sample as GeoJSON and as GeoPackage."""
-    geojson, gpkg = folder / "Äcker.geojson", folder / "Wege.gpkg"
+def make_vectors(folder: Path) -> tuple[Path, Path, Path]:
+    """Points of the sample as GeoJSON, as GeoPackage, and as CSV."""
+    geojson, gpkg, table = (folder / name for name in ("Äcker.geojson", "Wege.gpkg", "Orte.csv"))
+    table.write_text("name,lon,lat\nOrt,-75.68,37.69\n")
     features = [
         {
             "type": "Feature",
@@ -163,7 +164,7 @@ def make_vectors(folder: Path) -> tuple[Path, Path]:
     pyogrio.raw.write(
         gpkg, places, columns, about["fields"], crs=about["crs"], geometry_type=kind, driver="GPKG"
     )
-    return geojson, gpkg
+    return geojson, gpkg, table
 
 
 def without_date(gpkg: Path) -> str:
@@ -212,7 +213,7 @@ def same_corrections(home: Path, folder: Path) -> None:
             print(f"ok: apply: {name}, all tables the same but for last_change")
         else:
             assert mine.read_bytes() == theirs.read_bytes()
-            assert mine.read_bytes() not in (raster.read_bytes(), vectors[0].read_bytes())
+            assert mine.read_bytes() not in [source.read_bytes() for source in (raster, *vectors)]
             print(f"ok: apply: {name}, {mine.stat().st_size} bytes, all the same")
 
 
