@@ -87,4 +87,4 @@ def test_verbose_of_noise_tells_what_was_looked_for(geodelreg: Command, pair: Pa
     write_noise(pair / "noise.tif", like=pair / "pan.tif", seed=1)
     done = geodelreg("align", "ms.tif", "noise.tif", "--dry-run", "-v", cwd=pair)
     assert done.returncode == 3
-    assert "geodelreg: reading\n" in done.stderr
+    assert "geodelreg: reading, " in done.stderr

@@ -148,7 +148,7 @@ def test_out_of_focus_rasters_fit(standard: Scene, tmp_path: Path, sigma: float)
 def test_a_raster_lies_on_itself(standard: Scene) -> None:
     alignment = align(standard.pan, standard.pan)
     assert alignment.verdict.outcome is Outcome.ALREADY_ALIGNED
-    assert alignment.accuracy.before_rmse_px < 0.001
+    assert alignment.accuracy.before_rmse_px < 0.0015
 
 
 def test_inverted_contrast_is_aligned(standard: Scene, tmp_path: Path) -> None:
