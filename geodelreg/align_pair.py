@@ -17,6 +17,7 @@ from geodelreg.coarse.header import ProvenGuess
 from geodelreg.coarse.scopes import scopes
 from geodelreg.errors import NoOverlapError
 from geodelreg.fine.layers import Claim, on_the_mesh
+from geodelreg.fine.least_squares import Matched
 from geodelreg.fine.matching import patches_log_nfa, tie_points
 from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fine.settle import settle
@@ -38,7 +39,7 @@ from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import bands_warning, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
-from geodelreg.values.points import NO_TIE_POINTS, Guess, Status
+from geodelreg.values.points import NO_TIE_POINTS, Guess, Status, TiePoints
 from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, Solution
 from geodelreg.values.timings import Timings
@@ -208,21 +209,24 @@ def fit_patches(
     estimate = selection.estimate
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     tied = tie_points(part, last.matched, estimate.map, status)
-    counts = {
-        "patches": len(tied),
-        "patches matched": int((last.matched.status == Status.KEPT).sum()),
-        "patches kept": int(tied.kept.sum()),
-    }
     halves = points.take(estimate.inlier)
     apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
     sample_size = PARAMETER_COUNT[estimate.model] // 2
     return Fitted(
         selection,
         tied,
-        guess.counts | counts,
+        guess.counts | _patch_counts(last.matched, tied),
         patches_log_nfa(part, tied, sample_size),
         pair.pan_px_per_source_px * apart,
     )
+
+
+def _patch_counts(matched: Matched, tied: TiePoints) -> dict[str, int]:
+    return {
+        "patches": len(tied),
+        "patches matched": int((matched.status == Status.KEPT).sum()),
+        "patches kept": int(tied.kept.sum()),
+    }
 
 
 def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = False) -> Solution:
@@ -319,11 +323,7 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         log_nfa = patches_log_nfa(
             refined.part, replace(tied, residual_px=unseen), PARAMETER_COUNT["affine"] // 2
         )
-    counts = guess.counts | {
-        "patches": len(tied),
-        "patches matched": int((settled.matched.status == Status.KEPT).sum()),
-        "patches kept": int(tied.kept.sum()),
-    }
+    counts = guess.counts | _patch_counts(settled.matched, tied)
     return refined, Fitted(Selection(estimate, check), tied, counts, log_nfa, apart_px)
 
 
