@@ -22,6 +22,7 @@ from geodelreg_cli.options import (
     SectionOption,
     add_options,
     build,
+    flag,
     knob_option,
     knob_options,
     ms_and_pan,
@@ -86,10 +87,6 @@ class Request:
 
 def align_params() -> list[SectionOption]:
     """Options of ``align``, in the order of the help."""
-
-    def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
-        return SectionOption(names, section=section, **kwargs)
-
     return [
         flag(
             "-o",

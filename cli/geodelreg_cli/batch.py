@@ -18,6 +18,7 @@ from geodelreg_cli.options import (
     SectionOption,
     add_options,
     build,
+    flag,
     knob_option,
     knob_options,
     run_options,
@@ -65,10 +66,6 @@ be told; else 0. 2 wrong usage, or a manifest with a mistake: nothing was starte
 
 def batch_params() -> list[SectionOption]:
     """Options of ``batch``, in the order of the help."""
-
-    def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
-        return SectionOption(names, section=section, **kwargs)
-
     return [
         flag(
             "--pair",

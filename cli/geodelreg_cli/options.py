@@ -64,6 +64,11 @@ class SectionOption(click.Option):
         self.section = section
 
 
+def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
+    """An option by its names, under a heading."""
+    return SectionOption(names, section=section, **kwargs)
+
+
 class SectionCommand(click.Command):
     """A command whose help groups the options by section and keeps the layout of its epilog."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import stat
 import zipfile
 from collections.abc import Callable
@@ -15,22 +14,13 @@ import rasterio
 import rasterio.shutil
 
 from tests.cli.helpers import Command, snapshot
+from tests.integration.special_files import bound_socket
 
 IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 
 
 def pipe(path: Path) -> None:
     os.mkfifo(path)
-
-
-def bound_socket(path: Path) -> None:
-    here = Path.cwd()
-    os.chdir(path.parent)  # names of sockets are short
-    try:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(path.name)
-    finally:
-        os.chdir(here)
 
 
 def null_device(path: Path) -> None:

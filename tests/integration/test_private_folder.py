@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.inplace import edit_in_place
 from tests.integration.faults import contents, names, run_killed
 from tests.integration.raster_samples import GCPS, TAGS, correction_of, make_tiff
+from tests.integration.special_files import bound_socket
 
 ROOT = Path(__file__).parents[2]
 PRIVATE = ".ms.tif.geodelreg"
@@ -89,16 +89,6 @@ def hard_link_to_victim(path: Path) -> None:
 
 def hard_link_from_inside(path: Path) -> None:
     os.link(path.parents[2] / "victim", path)
-
-
-def bound_socket(path: Path) -> None:
-    here = Path.cwd()
-    os.chdir(path.parent)  # names of sockets are short
-    try:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(path.name)
-    finally:
-        os.chdir(here)
 
 
 def device(path: Path) -> None:
