@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from qgis.core import (
     QgsVectorLayer,
 )
 
-CANCELLED_AFTER_S = (0.0, 0.3, 0.7, 1.1, 1.6, 2.2)
+CANCELLED_AFTER = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75)  # of the time that a whole run takes here
 
 
 def cancel(folder: Path) -> None:
@@ -25,7 +26,8 @@ def cancel(folder: Path) -> None:
 
     slowest, named = 0.0, set(folder.rglob("*geodelreg*"))
     for name in ("align", "pansharpen"):
-        for wait in CANCELLED_AFTER_S:
+        whole_s = min(_whole_run_s(folder, name) for _ in range(2))
+        for wait in (part * whole_s for part in CANCELLED_AFTER):
             before, feedback = files(folder), Listening()
             asked: list[float] = []
 
@@ -46,9 +48,18 @@ def cancel(folder: Path) -> None:
             assert files(folder) == before
             assert set(folder.rglob("*geodelreg*")) == named
     assert slowest < 2
-    say(
-        f"cancelled at {2 * len(CANCELLED_AFTER_S)} moments: over within {slowest:.2f} s, no debris"
-    )
+    say(f"cancelled at {2 * len(CANCELLED_AFTER)} moments: over within {slowest:.2f} s, no debris")
+
+
+def _whole_run_s(folder: Path, name: str) -> float:
+    """How long a run takes that is not cancelled."""
+    import processing
+
+    with tempfile.TemporaryDirectory() as away:
+        begun = time.monotonic()
+        target = {**inputs(folder, 2), "OUTPUT": str(Path(away) / "whole.tif")}
+        processing.run(f"geodelreg:{name}", target)
+        return time.monotonic() - begun
 
 
 def cancel_batch(folder: Path) -> None:
