@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
-from geodelreg.image.arrays import is_xarray, placed_again, xarray_dataset
-from geodelreg.image.opening import dataset_grid
 from geodelreg.options import check_header_holds
 from geodelreg.product.figures import draw_tie_points
 from geodelreg.product.motion import HeaderMotion, header_motion
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.product.report import report_dict, short, summary_text, with_metres
+from geodelreg.raster.arrays import is_xarray, placed_again, xarray_dataset
+from geodelreg.raster.opening import dataset_grid
 from geodelreg.values import result
 from geodelreg.values.points import Status
 

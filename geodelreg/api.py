@@ -17,16 +17,16 @@ from geodelreg.errors import (
     NoOverlapError,
     UsageError,
 )
-from geodelreg.image.inputs import AnyMask, AnyRaster, split_masks
-from geodelreg.image.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
-from geodelreg.image.reader import RasterReader, check_band, open_raster
+from geodelreg.geotiff.private import unsettled
 from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
-from geodelreg.product.private import unsettled
 from geodelreg.product.provenance import fingerprint, versions
+from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
+from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
+from geodelreg.raster.reader import RasterReader, check_band, open_raster
 from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution
 from geodelreg.values.timings import Timings
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
-from geodelreg.image.reader import open_raster
 from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.stored import StoredCorrection, read_correction
+from geodelreg.raster.reader import open_raster
 from geodelreg.writing import AnyPath, input_paths
 
 
@@ -58,7 +58,7 @@ def apply(
     OutputExistsError, OutputUnwritableError, ...
         Nothing is then changed on disk.
     """
-    from geodelreg.product.atomic import together
+    from geodelreg.geotiff.atomic import together
     from geodelreg.product.vectors import VECTORS, write_vector
 
     options = options or WriteOptions()
@@ -82,11 +82,11 @@ def _apply_to_raster(
     force: bool,
     allow: str,
 ) -> list[str]:
-    from geodelreg.product.atomic import together
-    from geodelreg.product.geotiff import write_corrected
-    from geodelreg.product.inplace import edit_in_place
-    from geodelreg.product.sidecars import stale_beside
-    from geodelreg.product.targets import check_replaceable
+    from geodelreg.geotiff.atomic import together
+    from geodelreg.geotiff.corrected import write_corrected
+    from geodelreg.geotiff.inplace import edit_in_place
+    from geodelreg.geotiff.sidecars import stale_beside
+    from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
     with open_raster(file, allow=allow) as reader:

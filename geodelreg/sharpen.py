@@ -13,15 +13,15 @@ from geodelreg.door.names import as_path
 from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
-from geodelreg.image.opening import dataset_grid, open_dataset
-from geodelreg.image.reader import check_band, open_raster
+from geodelreg.geotiff.atomic import together
 from geodelreg.knobs import PansharpenKnobs
 from geodelreg.options import PansharpenOptions, check_header_holds
 from geodelreg.pair import Progress
-from geodelreg.product.atomic import together
 from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
 from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
 from geodelreg.product.provenance import provenance_tags
+from geodelreg.raster.opening import dataset_grid, open_dataset
+from geodelreg.raster.reader import check_band, open_raster
 from geodelreg.values.result import Alignment, Correction
 from geodelreg.writing import AnyPath, correction_of_file, input_paths, masks_of, paths_of
 

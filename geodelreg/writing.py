@@ -12,12 +12,12 @@ from typing import Unpack
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import as_allowed
 from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError, UsageError
-from geodelreg.image.input_files import input_files
-from geodelreg.image.reader import open_raster
 from geodelreg.knobs import WriteKnobs
 from geodelreg.masking import parse_mask
 from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.provenance import provenance_tags
+from geodelreg.raster.input_files import input_files
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Alignment, Correction, Outcome
@@ -66,10 +66,10 @@ def write(
     OutputExistsError, OutputIsInputError, OutputUnwritableError, LossyOutputError, ...
         Nothing is then changed on disk.
     """
-    from geodelreg.product.atomic import together
-    from geodelreg.product.geotiff import write_corrected
-    from geodelreg.product.sidecars import stale_beside
-    from geodelreg.product.targets import check_replaceable
+    from geodelreg.geotiff.atomic import together
+    from geodelreg.geotiff.corrected import write_corrected
+    from geodelreg.geotiff.sidecars import stale_beside
+    from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
     _check_accepted(alignment)
@@ -120,8 +120,8 @@ def write_in_place(alignment: Alignment) -> list[str]:
     UnsafeInPlaceError, FileLockedError, OutputUnwritableError
         The files are then as they were.
     """
-    from geodelreg.product.atomic import tidy, together
-    from geodelreg.product.inplace import edit_in_place
+    from geodelreg.geotiff.atomic import tidy, together
+    from geodelreg.geotiff.inplace import edit_in_place
 
     _check_accepted(alignment)
     _check_header_holds(alignment)
@@ -177,7 +177,7 @@ def revert(*paths: AnyPath) -> None:
     UnsafeInPlaceError, OutputUnwritableError, FileLockedError, RasterNotFoundError
         For one of the files; none is changed.
     """
-    from geodelreg.product.inplace import revert as revert_files
+    from geodelreg.geotiff.inplace import revert as revert_files
 
     revert_files(*map(Path, paths))
 
@@ -206,7 +206,7 @@ def export_gcps(
         If the format is not known.
     OutputExistsError, OutputIsInputError, OutputUnwritableError
     """
-    from geodelreg.product.atomic import together
+    from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
     _check_accepted(alignment)
@@ -241,7 +241,7 @@ def input_paths(names: Iterable[str], allow: str) -> list[Path]:
     list of Path
         The files, those that they consist of, and the side files that they have or could have.
     """
-    from geodelreg.product.sidecars import possible_sidecars
+    from geodelreg.geotiff.sidecars import possible_sidecars
 
     files = input_files(names, allow)
     return [*files, *(side for file in files for side in possible_sidecars(file))]
@@ -276,7 +276,7 @@ def masks_of(alignment: Alignment) -> list[str]:
 @contextmanager
 def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Path]]]:
     """MS files with their outputs; the folder for several is made, and taken back on an error."""
-    from geodelreg.product.targets import STDOUT
+    from geodelreg.geotiff.targets import STDOUT
 
     if target == STDOUT:
         raise UsageError("A raster cannot be written to standard output", "Name a file.")

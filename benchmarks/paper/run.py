@@ -22,7 +22,7 @@ from benchmarks.report import machine
 from benchmarks.scenes.imagery import ImageryNotFoundError
 from benchmarks.scenes.make import write_scene
 from benchmarks.scenes.truth import grid_rmse
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.points import Status
 
 SEEDS, QUICK_SEEDS = 3, 1

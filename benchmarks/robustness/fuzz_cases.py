@@ -199,7 +199,7 @@ def _correction(case: Case) -> Correction:
 
     Not of a VRT: `open_raster` is what bounds its size.
     """
-    from geodelreg.image.reader import open_raster
+    from geodelreg.raster.reader import open_raster
 
     if case.rng.random() < 0.3 and case.ms.suffix != ".vrt":
         case.parts.append("unchecked")
@@ -218,7 +218,7 @@ def _wkt() -> str:
 
 
 def _write(case: Case) -> None:
-    from geodelreg.product.geotiff import write_corrected
+    from geodelreg.geotiff.corrected import write_corrected
     from geodelreg.product.warp import write_warped
     from geodelreg.values.raster import Grid
 
@@ -236,7 +236,7 @@ def _write(case: Case) -> None:
 
 
 def _in_place(case: Case) -> None:
-    from geodelreg.product.inplace import edit_in_place, revert
+    from geodelreg.geotiff.inplace import edit_in_place, revert
 
     before = _state(case.folder)
     with _promises(case, may_change=True):
@@ -315,8 +315,8 @@ def _gcps(case: Case) -> None:
 
 
 def _revert(case: Case) -> None:
-    from geodelreg.product.inplace import edit_in_place, revert
-    from geodelreg.product.undo import record_path
+    from geodelreg.geotiff.inplace import edit_in_place, revert
+    from geodelreg.geotiff.undo import record_path
 
     seed = case.rng.choice([s for s in seeds(False, 80) if s.main == "ms.tif" and s.name != "cog"])
     shutil.rmtree(case.ms.parent)

@@ -225,8 +225,8 @@ def _check_outputs(request: Request) -> list[Path]:
     list of Path
         Everything that is read, down to the sources of VRTs and side files.
     """
-    from geodelreg.product.atomic import tidy
-    from geodelreg.product.targets import STDOUT, Inputs
+    from geodelreg.geotiff.atomic import tidy
+    from geodelreg.geotiff.targets import STDOUT, Inputs
     from geodelreg.report.output import check_report
     from geodelreg_cli.outputs import check_targets, raster_targets
 
@@ -281,7 +281,7 @@ def _check_gcp_formats(request: Request) -> None:
 def _run(request: Request, inputs: Sequence[Path]) -> None:
     """Align, then write what was asked for, all or nothing; a refusal leaves the reports only."""
     import geodelreg
-    from geodelreg.product.atomic import together
+    from geodelreg.geotiff.atomic import together
     from geodelreg.product.report import summary_text
 
     source = request.sources[0] if len(request.sources) == 1 else request.sources
@@ -370,7 +370,7 @@ def _draw(alignment: Alignment, request: Request) -> None:
 
 def _reports(alignment: Alignment, request: Request) -> list[tuple[Path, str]]:
     """Where reports go, and their texts."""
-    from geodelreg.product.targets import STDOUT
+    from geodelreg.geotiff.targets import STDOUT
     from geodelreg.report.output import report_text
 
     paths = [*request.reports, *([STDOUT] if request.json else [])]
@@ -378,7 +378,7 @@ def _reports(alignment: Alignment, request: Request) -> list[tuple[Path, str]]:
 
 
 def _write_texts(texts: Sequence[tuple[Path, str]], request: Request) -> None:
-    from geodelreg.product.atomic import write_text_atomically
+    from geodelreg.geotiff.atomic import write_text_atomically
 
     for path, text in texts:
         write_text_atomically(path, text, request.write_options.overwrite)

@@ -82,7 +82,7 @@ def apply(
     if in_place and options != WriteOptions():
         raise click.UsageError("--in-place corrects the header and nothing else.")
     import geodelreg
-    from geodelreg.product.atomic import together
+    from geodelreg.geotiff.atomic import together
     from geodelreg_cli.outputs import raster_targets
 
     targets = [] if output is None else raster_targets([str(file) for file in files], output)

@@ -78,9 +78,9 @@ def gcps(
     configure_logging(verbose, quiet, debug)
     keep_to(allow)
     from geodelreg.door.opening import allowing
-    from geodelreg.image.reader import open_raster
-    from geodelreg.product.atomic import together
+    from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
+    from geodelreg.raster.reader import open_raster
     from geodelreg.writing import input_paths
 
     def grid(path: str) -> Grid:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geodelreg.errors import OutputUnwritableError, UsageError
-from geodelreg.product.durable import unwritable
-from geodelreg.product.sidecars import possible_sidecars
-from geodelreg.product.targets import STDOUT, Inputs, check_replaceable
+from geodelreg.geotiff.durable import unwritable
+from geodelreg.geotiff.sidecars import possible_sidecars
+from geodelreg.geotiff.targets import STDOUT, Inputs, check_replaceable
 
 
 def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:

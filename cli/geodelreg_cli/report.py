@@ -70,7 +70,7 @@ def report(result: Path, rasters: tuple[str, ...], **given: Any) -> None:
     """
     start_run(given)
     sources, reference = ms_and_pan(rasters)
-    from geodelreg.product.atomic import write_text_atomically
+    from geodelreg.geotiff.atomic import write_text_atomically
     from geodelreg.report.again import read_again
     from geodelreg.report.html import check_jinja
     from geodelreg.report.page import page

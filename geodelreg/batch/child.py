@@ -85,7 +85,7 @@ def _warm_up() -> None:
     import rasterio  # noqa: F401
 
     import geodelreg.api
-    import geodelreg.product.geotiff
+    import geodelreg.geotiff.corrected
     import geodelreg.product.warp  # noqa: F401
 
     cv2.setNumThreads(1)
@@ -133,7 +133,7 @@ def run_task(task: Task) -> tuple[PairResult, bool]:
 
 def tidy_up(task: Task) -> None:
     """Remove what a killed process has left beside the outputs of a pair."""
-    from geodelreg.product.atomic import tidy
+    from geodelreg.geotiff.atomic import tidy
 
     tidy(map(Path, task.pair.sources) if task.mode == IN_PLACE else task.pair.targets)
 
@@ -141,9 +141,9 @@ def tidy_up(task: Task) -> None:
 def _align(task: Task, result: PairResult) -> PairResult:
     import geodelreg
     from geodelreg.geo.lonlat import footprint
+    from geodelreg.geotiff.targets import make_folder
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.provenance import provenance_tags, written_tags
-    from geodelreg.product.targets import make_folder
 
     pair = task.pair
     options = AlignOptions(**pair.align, threads=1)
@@ -220,7 +220,7 @@ def _write_page(task: Task, alignment: Alignment, check: Check | None = None) ->
     """Write the page to look at, where one is asked for; without it the pair is none the worse."""
     if not task.page:
         return
-    from geodelreg.product.atomic import write_text_atomically
+    from geodelreg.geotiff.atomic import write_text_atomically
     from geodelreg.report.page import page
 
     try:

@@ -23,8 +23,8 @@ from geodelreg.batch.tables import check_format, write_table
 from geodelreg.door.formats import skip_the_rest
 from geodelreg.door.names import ALL
 from geodelreg.errors import ClusterError, PairCrashedError, UsageError
+from geodelreg.geotiff.targets import check_replaceable, make_folder
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
-from geodelreg.product.targets import check_replaceable, make_folder
 from geodelreg.report.index import PAGES, page_name
 
 AnyPath = str | PathLike[str]
@@ -202,7 +202,7 @@ class Batch:
         FileLockedError
             Another process runs this ledger.
         """
-        from geodelreg.product.atomic import exclusive
+        from geodelreg.geotiff.atomic import exclusive
 
         with exclusive(self.path), Ledger(self.path) as ledger:
             ledger.retry(self._retry)

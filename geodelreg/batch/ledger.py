@@ -19,7 +19,7 @@ from pathlib import Path
 from geodelreg import __version__
 from geodelreg.batch.job import Pair, PairResult
 from geodelreg.errors import LedgerError
-from geodelreg.product.atomic import staged
+from geodelreg.geotiff.atomic import staged
 
 VERSION = 1
 _APPLICATION = 0x67656F64  # "geod", for `file` and for us

@@ -12,7 +12,7 @@ from typing import Any
 
 from geodelreg.batch.job import FIGURES, PairResult
 from geodelreg.errors import MissingExtraError, UsageError
-from geodelreg.product.atomic import staged
+from geodelreg.geotiff.atomic import staged
 
 _BEFORE = ("number", "sources", "reference", "output", "outcome", "error", "reason", "warnings")
 _AFTER = ("duration_s", "attempts", "host")

@@ -18,9 +18,9 @@ from geodelreg.errors import NoOverlapError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.grid import gsd_px_m, outline
-from geodelreg.product import metadata
-from geodelreg.product.header import Provenance
-from geodelreg.product.view import corrected_view
+from geodelreg.geotiff import metadata
+from geodelreg.geotiff.header import Provenance
+from geodelreg.geotiff.view import corrected_view
 from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.product.atomic import write_bytes_atomically
-from geodelreg.product.targets import STDOUT
+from geodelreg.geotiff.atomic import write_bytes_atomically
+from geodelreg.geotiff.targets import STDOUT
 from geodelreg.values.raster import Band, FloatArray, Grid, IntArray
 from geodelreg.values.result import Alignment
 

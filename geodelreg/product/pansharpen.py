@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import UsageError
+from geodelreg.geotiff import sidecars
+from geodelreg.geotiff.atomic import staged
+from geodelreg.geotiff.environment import gdal_session
+from geodelreg.geotiff.rewrite import gdal_write, output_driver, user_creation
 from geodelreg.options import PansharpenOptions
-from geodelreg.product import sidecars
-from geodelreg.product.atomic import staged
 from geodelreg.product.common_grid import (
     Recipe,
     Sharpening,
@@ -35,8 +37,6 @@ from geodelreg.product.common_grid import (
     recipe_of,
     target_grid,
 )
-from geodelreg.product.environment import gdal_session
-from geodelreg.product.rewrite import gdal_write, output_driver, user_creation
 from geodelreg.product.warp import Validity, warped_onto
 from geodelreg.values.raster import Float32Array, Grid
 

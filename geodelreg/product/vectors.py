@@ -13,7 +13,7 @@ import numpy as np
 
 from geodelreg.door.vectors import GEOJSON, check_vector
 from geodelreg.errors import MissingExtraError, RasterUnreadableError, VectorUnreadableError
-from geodelreg.product.atomic import staged, write_text_atomically
+from geodelreg.geotiff.atomic import staged, write_text_atomically
 from geodelreg.product.stored import StoredCorrection
 from geodelreg.values.raster import FloatArray
 

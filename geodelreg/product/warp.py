@@ -18,18 +18,18 @@ from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.grid import outline
+from geodelreg.geotiff import compare, metadata, sidecars
+from geodelreg.geotiff.atomic import staged
+from geodelreg.geotiff.corrected import check_source
+from geodelreg.geotiff.environment import gdal_session
+from geodelreg.geotiff.header import Provenance
+from geodelreg.geotiff.rewrite import gdal_write, output_driver, rewrite, user_creation
+from geodelreg.geotiff.srs import keep, spatial_reference
+from geodelreg.geotiff.targets import check_not_input
+from geodelreg.geotiff.view import corrected_view
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
-from geodelreg.product import compare, metadata, sidecars
-from geodelreg.product.atomic import staged
-from geodelreg.product.environment import gdal_session
-from geodelreg.product.geotiff import check_source
-from geodelreg.product.header import Provenance
 from geodelreg.product.lookup import looked_up, lookups_of
-from geodelreg.product.rewrite import gdal_write, output_driver, rewrite, user_creation
-from geodelreg.product.srs import keep, spatial_reference
-from geodelreg.product.targets import check_not_input
-from geodelreg.product.view import corrected_view
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, Grid
 from geodelreg.values.result import Correction

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from geodelreg.errors import ReportError
-from geodelreg.image.reader import open_raster
 from geodelreg.product.provenance import fingerprint
 from geodelreg.product.reading import read_report
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.result import Alignment, Input
 
 

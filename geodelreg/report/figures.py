@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geodelreg.image.reader import RasterReader, open_raster
 from geodelreg.product.figures import check_drawable, draw_before_after, draw_matches, figure_file
+from geodelreg.raster.reader import RasterReader, open_raster
 from geodelreg.report import drawing, words
 from geodelreg.report.drawing import Canvas
 from geodelreg.report.frame import frame_of

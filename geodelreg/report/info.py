@@ -12,10 +12,10 @@ from geodelreg.door.opening import open_raster as open_dataset
 from geodelreg.errors import CrsTransformError, shown
 from geodelreg.geo.grid import gsd_px_m, is_north_up
 from geodelreg.geo.lonlat import footprint
-from geodelreg.image.reader import open_raster
 from geodelreg.masking import quality_bands
 from geodelreg.product.provenance import written_tags
 from geodelreg.product.report import plain
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Grid
 
 

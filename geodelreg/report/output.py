@@ -5,9 +5,9 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from geodelreg.product.atomic import write_text_atomically
+from geodelreg.geotiff.atomic import write_text_atomically
+from geodelreg.geotiff.targets import STDOUT
 from geodelreg.product.report import report_json
-from geodelreg.product.targets import STDOUT
 from geodelreg.report.html import check_jinja
 from geodelreg.values.result import Alignment
 

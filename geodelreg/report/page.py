@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.image.reader import open_raster
 from geodelreg.options import AlignOptions
 from geodelreg.product.check import Check
 from geodelreg.product.report import short
+from geodelreg.raster.reader import open_raster
 from geodelreg.report import drawing, words
 from geodelreg.report.drawing import Canvas
 from geodelreg.report.frame import Frame, frame_of

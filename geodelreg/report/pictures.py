@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geodelreg.geo.grid import window_around
 from geodelreg.geo.pixel import corner_to_centre, pixel_centres
-from geodelreg.image.reader import RasterReader
+from geodelreg.raster.reader import RasterReader
 from geodelreg.report.frame import Frame
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Window
 from geodelreg.values.result import Alignment

@@ -82,7 +82,7 @@ class Band:
 
 
 class WindowReader(Protocol):
-    """Pixels on demand.  `geodelreg.image.reader` has it on rasterio, tests have it on arrays."""
+    """Pixels on demand.  `geodelreg.raster.reader` has it on rasterio, tests have it on arrays."""
 
     @property
     def grid(self) -> Grid:

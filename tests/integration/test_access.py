@@ -12,7 +12,7 @@ import rasterio
 
 from geodelreg.door.names import LOCAL, NETWORK, needed_access
 from geodelreg.errors import AccessNotAllowedError, RasterUnreadableError
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
 from tests.cli.helpers import COMMAND
 from tests.integration.loopback import Server

@@ -22,10 +22,10 @@ from geodelreg.errors import (
     OutputIsInputError,
     OutputUnwritableError,
 )
+from geodelreg.geotiff.atomic import staged, write_text_atomically
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.targets import check_not_input
 from geodelreg.options import WriteOptions
-from geodelreg.product.atomic import staged, write_text_atomically
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.targets import check_not_input
 from tests.integration.faults import (
     contents,
     names,
@@ -231,7 +231,7 @@ def test_many_processes_write_one_target(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "from geodelreg.errors import FileLockedError\n"
-        "from geodelreg.product.atomic import write_text_atomically\n"
+        "from geodelreg.geotiff.atomic import write_text_atomically\n"
         "for n in range(150):\n"
         "    try: write_text_atomically(Path(sys.argv[1]), sys.argv[2] * 5000, overwrite=True)\n"
         "    except FileLockedError: pass\n"
@@ -330,7 +330,7 @@ import resource, signal, sys
 from pathlib import Path
 from geodelreg.errors import OutputUnwritableError
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
+from geodelreg.geotiff.corrected import write_corrected
 from tests.integration.raster_samples import GCPS, TAGS, correction_of
 source, target, limit = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 correction = correction_of(source)
@@ -364,7 +364,7 @@ LOOP = """
 import sys
 from pathlib import Path
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
+from geodelreg.geotiff.corrected import write_corrected
 from tests.integration.raster_samples import GCPS, TAGS, correction_of
 source, target = map(Path, sys.argv[1:])
 print("ready", flush=True)

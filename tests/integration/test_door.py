@@ -27,10 +27,10 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
 )
-from geodelreg.image.reader import open_raster
+from geodelreg.geotiff.corrected import write_corrected
 from geodelreg.options import WriteOptions
 from geodelreg.product.gcps import GcpContext, read_gcps
-from geodelreg.product.geotiff import write_corrected
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Grid, Window
 from tests.cli.helpers import COMMAND
 from tests.integration.faults import names

@@ -24,16 +24,16 @@ from geodelreg.batch.job import Pair, Task
 from geodelreg.batch.supervisor import Child
 from geodelreg.errors import GeodelregError
 from geodelreg.geo.maps.affine import IDENTITY
-from geodelreg.image.reader import open_raster
+from geodelreg.geotiff.atomic import exclusive, write_text_atomically
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.inplace import edit_in_place
 from geodelreg.options import WriteOptions
-from geodelreg.product.atomic import exclusive, write_text_atomically
 from geodelreg.product.figures import check_drawable
 from geodelreg.product.gcps import read_gcps
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.reading import read_report
 from geodelreg.product.stored import StoredCorrection
 from geodelreg.product.vectors import write_vector
+from geodelreg.raster.reader import open_raster
 from tests.integration.raster_samples import GCPS, TAGS, UTM18, correction_of, make_cog
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -21,11 +21,11 @@ from benchmarks.robustness.mutations import parse
 from benchmarks.robustness.seeds import make_seeds
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.fatal import check_survivable
-from geodelreg.image.reader import open_raster
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.inplace import edit_in_place
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.warp import write_warped
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Grid, Window
 from tests.integration.faults import contents
 from tests.integration.raster_samples import (

@@ -16,7 +16,7 @@ from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import HeaderError, Scene, SceneSpec, make_scene, write_scene
 from benchmarks.scenes.truth import check_points
 from geodelreg import AlignOptions
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 
 SPEC = SceneSpec("filled", "", HeaderError((5.3, -4.7)), (500, 500), (230, 230), ratio=2.0)
 

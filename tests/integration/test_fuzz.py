@@ -21,9 +21,9 @@ from benchmarks.robustness.fuzz import Worker
 from benchmarks.robustness.fuzz_cases import GCPS, SHIFT, TAGS, WRITE_OPTIONS, run_case, seeds
 from benchmarks.robustness.hostile.families import is_hostile
 from geodelreg.errors import GeodelregError
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.inplace import edit_in_place
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.inplace import edit_in_place
 from geodelreg.product.warp import write_warped
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction

@@ -19,8 +19,8 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UsageError,
 )
+from geodelreg.geotiff.corrected import write_corrected
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
 from geodelreg.values.result import Correction
 from tests.integration.raster_samples import (
     ENCODINGS,

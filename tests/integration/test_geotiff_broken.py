@@ -12,9 +12,9 @@ import pytest
 import rasterio
 
 from geodelreg.errors import GeodelregError, RasterUnreadableError
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.inplace import edit_in_place, revert
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.inplace import edit_in_place, revert
 from geodelreg.tiff import TiffFile
 from geodelreg.values.result import Correction
 from tests.integration.faults import names

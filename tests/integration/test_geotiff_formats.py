@@ -18,8 +18,8 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UsageError,
 )
+from geodelreg.geotiff.corrected import write_corrected
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
 from tests.integration.faults import names
 from tests.integration.raster_samples import (
     GCPS,

@@ -11,9 +11,9 @@ import tifffile
 from affine import Affine
 
 from geodelreg.errors import OutputExistsError
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.sidecars import without_placement
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.sidecars import without_placement
 from tests.integration.faults import contents
 from tests.integration.raster_samples import (
     GCPS,

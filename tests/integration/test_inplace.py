@@ -30,7 +30,7 @@ from geodelreg.errors import (
     RasterNotFoundError,
     UnsafeInPlaceError,
 )
-from geodelreg.product.inplace import edit_in_place, revert
+from geodelreg.geotiff.inplace import edit_in_place, revert
 from geodelreg.values.result import Correction, Outcome, Verdict
 from tests.integration.faults import (
     contents,
@@ -459,7 +459,7 @@ LOOP = """
 import sys
 from pathlib import Path
 from affine import Affine
-from geodelreg.product.inplace import edit_in_place, revert
+from geodelreg.geotiff.inplace import edit_in_place, revert
 from tests.integration.raster_samples import GCPS, TAGS, correction_of
 raster = Path(sys.argv[1])
 print("ready", flush=True)

@@ -20,8 +20,8 @@ from rasterio.enums import Resampling
 from shapely.geometry import mapping
 
 from geodelreg.errors import MaskError, MissingExtraError
-from geodelreg.image import mask_raster, mask_vector
-from geodelreg.image.reader import open_raster
+from geodelreg.raster import mask_raster, mask_vector
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import BoolArray, Window
 from tests.conftest import TRANSFORM, UTM16, WriteRaster
 
@@ -196,7 +196,7 @@ def test_overviews_are_masked_where_their_pixels_lie(
     values = np.zeros((512, 512), dtype=np.uint8)
     values[64:192, 256:320] = 1
     mask = write_raster("mask.tif", values)
-    monkeypatch.setattr("geodelreg.image.reader._EXACT_PIXELS", 1000)
+    monkeypatch.setattr("geodelreg.raster.reader._EXACT_PIXELS", 1000)
     with open_raster(image, [str(mask)]) as reader:
         band = reader.read([1], Window(0, 0, 512, 512), (64, 64))[0]
     assert np.array_equal(~band.valid, values[::8, ::8] > 0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import geodelreg
 from geodelreg import PansharpenOptions
 from geodelreg.errors import NoOverlapError, OutputIsInputError, UsageError
-from geodelreg.product.atomic import together
+from geodelreg.geotiff.atomic import together
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_tiles"
 UTM = "EPSG:32618"

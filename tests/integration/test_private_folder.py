@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from geodelreg.errors import OutputUnwritableError
+from geodelreg.geotiff.atomic import staged, write_text_atomically
+from geodelreg.geotiff.corrected import write_corrected
+from geodelreg.geotiff.inplace import edit_in_place
 from geodelreg.options import WriteOptions
-from geodelreg.product.atomic import staged, write_text_atomically
-from geodelreg.product.geotiff import write_corrected
-from geodelreg.product.inplace import edit_in_place
 from tests.integration.faults import contents, names, run_killed
 from tests.integration.raster_samples import GCPS, TAGS, correction_of, make_tiff
 from tests.integration.special_files import bound_socket
@@ -194,7 +194,7 @@ def test_folder_of_another_user_is_refused_even_by_root(home: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from geodelreg.product.atomic import staged
+from geodelreg.geotiff.atomic import staged
 real = os.replace
 def replace(*args, **kwargs):
     real(*args, **kwargs)
@@ -307,7 +307,7 @@ AS_NOBODY = """
 import os, sys
 from pathlib import Path
 from geodelreg_cli.console import configure_logging
-from geodelreg.product.atomic import write_text_atomically
+from geodelreg.geotiff.atomic import write_text_atomically
 os.setgid(65534)
 os.setuid(65534)
 configure_logging(0, False, False)

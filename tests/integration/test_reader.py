@@ -14,7 +14,7 @@ from rasterio.enums import ColorInterp
 from rasterio.env import get_gdal_config, set_gdal_config
 
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
-from geodelreg.image.reader import check_band, open_raster
+from geodelreg.raster.reader import check_band, open_raster
 from geodelreg.values.raster import Band, Window
 from tests.conftest import TRANSFORM, WriteRaster
 

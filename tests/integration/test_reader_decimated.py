@@ -13,9 +13,9 @@ from affine import Affine
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-import geodelreg.image.raster_file
-import geodelreg.image.reader
-from geodelreg.image.reader import open_raster
+import geodelreg.raster.raster_file
+import geodelreg.raster.reader
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Band, Grid, Window
 from tests.conftest import WriteRaster
 
@@ -25,7 +25,7 @@ SIZES = [(512, 256), (501, 777), (1570, 391)]
 @pytest.fixture
 def use_overviews(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small windows are averaged from full resolution; here they must not be."""
-    monkeypatch.setattr(geodelreg.image.reader, "_EXACT_PIXELS", 0)
+    monkeypatch.setattr(geodelreg.raster.reader, "_EXACT_PIXELS", 0)
 
 
 def ramps(height: int, width: int) -> NDArray[np.float32]:
@@ -194,7 +194,7 @@ def test_pieces_do_not_show(
     window = Window(7, 11, 480, 240)
     with open_raster(path) as reader:
         whole = reader.read([1, 3], window, shape)
-        monkeypatch.setattr(geodelreg.image.raster_file, "_PIECE_PIXELS", 3000)
+        monkeypatch.setattr(geodelreg.raster.raster_file, "_PIECE_PIXELS", 3000)
         pieces = reader.read([1, 3], window, shape)
     for one, other in zip(whole, pieces, strict=True):
         np.testing.assert_array_equal(one.valid, other.valid)
@@ -218,7 +218,7 @@ def test_memory_does_not_grow_with_the_raster(tmp_path: Path) -> None:
         pass
     script = """
 import resource, sys
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
 with open_raster(sys.argv[1]) as reader:
     reader.read([1], Window(0, 0, 600, 600), (200, 200))
@@ -237,7 +237,7 @@ def test_pieces_cut_no_block(write_raster: WriteRaster, bands: int, side: int) -
     data = np.ones((1, 1100, 1300), dtype=np.uint8)
     path = write_raster("a.tif", data, tiled=True, blockxsize=side, blockysize=side)
     with rasterio.open(path) as dataset:
-        pieces = geodelreg.image.raster_file._pieces(dataset, (0, 0), (1300, 1100), bands)
+        pieces = geodelreg.raster.raster_file._pieces(dataset, (0, 0), (1300, 1100), bands)
     assert sum(piece.width * piece.height for piece in pieces) == data.size
     for piece in pieces:
         assert piece.column % side == 0

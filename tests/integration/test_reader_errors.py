@@ -17,7 +17,7 @@ from rasterio.rpc import RPC
 from geodelreg import errors
 from geodelreg.door.names import ALL
 from geodelreg.errors import GeodelregError
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
 from tests.conftest import WriteRaster
 

@@ -12,8 +12,8 @@ import pytest
 import rasterio
 from affine import Affine
 
-import geodelreg.image.raster_file
-from geodelreg.image.reader import open_raster
+import geodelreg.raster.raster_file
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
 
 SIDE = 6144
@@ -23,7 +23,7 @@ KEPT_MB = 45
 CHILD = """
 import json, sys
 import numpy
-from geodelreg.image.reader import open_raster
+from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
 
 def status(name):
@@ -66,7 +66,7 @@ def test_decimated_read_needs_little_memory_and_keeps_less(large: Path) -> None:
 def test_number_of_threads_does_not_show(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = []
     for most in (1, 3):
-        monkeypatch.setattr(geodelreg.image.raster_file, "_MOST_THREADS", most)
+        monkeypatch.setattr(geodelreg.raster.raster_file, "_MOST_THREADS", most)
         monkeypatch.setattr("os.cpu_count", lambda: 8)
         with open_raster(large) as reader:
             (band,) = reader.read([1], Window(5, 7, SIDE - 9, SIDE - 8), (311, 517))

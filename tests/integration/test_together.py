@@ -28,8 +28,8 @@ from geodelreg.errors import (
     UnsafeInPlaceError,
     UsageError,
 )
-from geodelreg.product.atomic import staged, tidy, together, write_text_atomically
-from geodelreg.product.inplace import edit_in_place
+from geodelreg.geotiff.atomic import staged, tidy, together, write_text_atomically
+from geodelreg.geotiff.inplace import edit_in_place
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment
 from tests.integration.faults import contents, names, restore, run_killed, run_with_error
@@ -280,7 +280,7 @@ def test_runs_with_common_targets_exclude_each_other(folder: Path) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "from geodelreg.errors import FileLockedError\n"
-        "from geodelreg.product.atomic import together, write_text_atomically\n"
+        "from geodelreg.geotiff.atomic import together, write_text_atomically\n"
         "paths = [Path(name) for name in sys.argv[2:]]\n"
         "done = 0\n"
         "while done < 40:\n"

@@ -19,8 +19,8 @@ from geodelreg.errors import (
     OutputIsInputError,
     UnsupportedGeoreferenceError,
 )
+from geodelreg.geotiff.corrected import write_corrected
 from geodelreg.options import WriteOptions
-from geodelreg.product.geotiff import write_corrected
 from geodelreg.product.warp import north_up_grid, write_warped
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction

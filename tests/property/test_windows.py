@@ -13,7 +13,7 @@ from pyproj import CRS
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.geo.grid import decimated_grid, gsd_px_m
-from geodelreg.image.decimate import BoxAverage
+from geodelreg.raster.decimate import BoxAverage
 from geodelreg.values.raster import Grid, Window
 
 UTM = CRS.from_epsg(32616).to_wkt()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from geodelreg.errors import UsageError
-from geodelreg.image.quality import hidden_values, impossible_values
 from geodelreg.masking import (
     MaskSpec,
     flag_bands,
@@ -18,6 +17,7 @@ from geodelreg.masking import (
     quality_kind,
 )
 from geodelreg.options import AlignOptions
+from geodelreg.raster.quality import hidden_values, impossible_values
 
 # USGS, Landsat 8-9 Collection 2 Level 2 Science Product Guide (LSDS-1619), table 6-3, and for
 # Landsat 4-7 (LSDS-1618), table 5-3: value, and whether ground is seen

@@ -54,7 +54,7 @@ def _check(plan: Plan) -> None:
 
 
 def _correction(plan: Plan) -> Correction:
-    from geodelreg.image.reader import open_raster
+    from geodelreg.raster.reader import open_raster
 
     with open_raster(plan.ms) as reader:
         grid = reader.grid
@@ -62,7 +62,7 @@ def _correction(plan: Plan) -> Correction:
 
 
 def _write(plan: Plan) -> None:
-    from geodelreg.product.geotiff import write_corrected
+    from geodelreg.geotiff.corrected import write_corrected
 
     if not plan.is_about_crs:  # for PAN is in another
         _check(plan)
@@ -71,7 +71,7 @@ def _write(plan: Plan) -> None:
 
 
 def _in_place(plan: Plan) -> None:
-    from geodelreg.product.inplace import edit_in_place
+    from geodelreg.geotiff.inplace import edit_in_place
 
     if not plan.is_about_crs:
         _check(plan)

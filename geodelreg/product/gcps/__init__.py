@@ -16,7 +16,7 @@ import numpy as np
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.product.atomic import write_text_atomically
+from geodelreg.geotiff.atomic import write_text_atomically
 from geodelreg.product.gcps import envi, geojson, optfile, qgis, table, vrt
 from geodelreg.product.gcps.context import (
     Decoded,

@@ -12,10 +12,10 @@ import numpy as np
 from geodelreg.door.names import LOCAL, check_name
 from geodelreg.door.vectors import is_vector
 from geodelreg.errors import AccessNotAllowedError, GeodelregError, MaskError
-from geodelreg.image.inputs import AnyMask, Opened, mask_opened, opened
-from geodelreg.image.mask_raster import RasterMask
-from geodelreg.image.mask_vector import VectorMask
 from geodelreg.masking import MASK_KINDS, MaskSpec, MaskUse, Ranges, parse_mask
+from geodelreg.raster.inputs import AnyMask, Opened, mask_opened, opened
+from geodelreg.raster.mask_raster import RasterMask
+from geodelreg.raster.mask_vector import VectorMask
 from geodelreg.values.raster import BoolArray, Grid
 
 _WHOLE = 0.995

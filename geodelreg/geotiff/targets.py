@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from geodelreg.errors import OutputExistsError, OutputIsInputError, OutputUnwritableError
-from geodelreg.product.durable import unwritable
+from geodelreg.geotiff.durable import unwritable
 
 STDOUT = Path("-")
 """In place of the name of a side output: standard output."""

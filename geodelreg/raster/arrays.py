@@ -19,7 +19,7 @@ from geodelreg.errors import (
     RasterUnreadableError,
 )
 from geodelreg.geo.pixel import corner_to_centre, pixel_centres
-from geodelreg.image.chunks import Chunks, Fetch
+from geodelreg.raster.chunks import Chunks, Fetch
 from geodelreg.values.raster import Grid
 
 _CODE = re.compile(r"[A-Za-z]+:[\w.]+$")

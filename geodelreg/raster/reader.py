@@ -17,18 +17,18 @@ import numpy as np
 from geodelreg.door.names import LOCAL
 from geodelreg.errors import BandGridError, BandNumberError, UsageError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.environment import (
+from geodelreg.raster.environment import (
     TILES_BYTES,
     bounded_cache,
     gdal_calls,
     passing_through,
 )
-from geodelreg.image.inputs import AnyMask, AnyRaster, as_list, opened
-from geodelreg.image.raster_file import RasterFile
+from geodelreg.raster.inputs import AnyMask, AnyRaster, as_list, opened
+from geodelreg.raster.raster_file import RasterFile
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
-    from geodelreg.image.masks import Masks
+    from geodelreg.raster.masks import Masks
 
 logger = logging.getLogger(__name__)
 
@@ -230,7 +230,7 @@ class RasterReader:
         ]
         if names is None or not (names or bands):
             return None
-        from geodelreg.image.masks import Masks
+        from geodelreg.raster.masks import Masks
 
         masks = Masks(self.grid, self.name, names, bands, stack, allow)
         for file in self._files:

@@ -11,8 +11,8 @@ from pathlib import Path
 from geodelreg.door.names import LOCAL, is_local
 from geodelreg.door.vectors import is_vector
 from geodelreg.errors import GeodelregError
-from geodelreg.image.environment import gdal_calls
-from geodelreg.image.opening import open_dataset
+from geodelreg.raster.environment import gdal_calls
+from geodelreg.raster.opening import open_dataset
 from geodelreg.tiff import is_tiff
 
 _WITH_A_VECTOR = {

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from geodelreg.errors import UnsafeInPlaceError
-from geodelreg.product import sidecars
-from geodelreg.product.durable import fsync_folder, replace_bytes, write_fully
+from geodelreg.geotiff import sidecars
+from geodelreg.geotiff.durable import fsync_folder, replace_bytes, write_fully
 
 _VERSION = 2
 _LARGEST_BYTES = 1 << 28

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from geodelreg.door.opening import open_raster
-from geodelreg.product.sidecars import DOMAIN
+from geodelreg.geotiff.sidecars import DOMAIN
 
 logger = logging.getLogger(__name__)
 

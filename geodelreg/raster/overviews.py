@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodelreg.image.decimate import BoxAverage
+from geodelreg.raster.decimate import BoxAverage
 from geodelreg.values.raster import BoolArray, Float32Array, Window
 
 logger = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from geodelreg.errors import (
     UnsupportedGeoreferenceError,
 )
 from geodelreg.fatal import contradiction
-from geodelreg.image.environment import gdal_calls
+from geodelreg.raster.environment import gdal_calls
 from geodelreg.values.raster import Grid
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from geodelreg.errors import (
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
 )
-from geodelreg.image.arrays import array_dataset, is_xarray, xarray_dataset
-from geodelreg.image.opening import dataset_grid, open_dataset
+from geodelreg.raster.arrays import array_dataset, is_xarray, xarray_dataset
+from geodelreg.raster.opening import dataset_grid, open_dataset
 from geodelreg.values.raster import Grid
 
 if TYPE_CHECKING:

@@ -13,16 +13,16 @@ from pathlib import Path
 from geodelreg.door.names import is_local
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import RasterUnreadableError, UsageError
+from geodelreg.geotiff import compare, metadata, sidecars
+from geodelreg.geotiff.atomic import staged
+from geodelreg.geotiff.copying import open_source
+from geodelreg.geotiff.environment import gdal_failures, gdal_session
+from geodelreg.geotiff.header import Provenance
+from geodelreg.geotiff.rewrite import output_driver, rewrite
+from geodelreg.geotiff.srs import keep, spatial_reference
+from geodelreg.geotiff.targets import check_not_input
+from geodelreg.geotiff.tiffwrite import copy_with_header, is_cog
 from geodelreg.options import WriteOptions
-from geodelreg.product import compare, metadata, sidecars
-from geodelreg.product.atomic import staged
-from geodelreg.product.copying import open_source
-from geodelreg.product.environment import gdal_failures, gdal_session
-from geodelreg.product.header import Provenance
-from geodelreg.product.rewrite import output_driver, rewrite
-from geodelreg.product.srs import keep, spatial_reference
-from geodelreg.product.targets import check_not_input
-from geodelreg.product.tiffwrite import copy_with_header, is_cog
 from geodelreg.tiff import is_tiff
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Correction

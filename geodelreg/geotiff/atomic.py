@@ -1,10 +1,10 @@
 """Outputs that appear whole or not at all, one or many of them.
 
-Every output is written into a private folder beside its target (`geodelreg.product.private`),
+Every output is written into a private folder beside its target (`geodelreg.geotiff.private`),
 flushed to the disk and renamed into place, side files first and the target itself last.  What a
 killed process leaves behind is found by the next one that writes one of the same targets: it
 finishes the work where that had been decided, otherwise it takes it back
-(`geodelreg.product.journal`).
+(`geodelreg.geotiff.journal`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from geodelreg.errors import (
     FileLockedError,
     OutputUnwritableError,
 )
-from geodelreg.product import journal, undo
-from geodelreg.product.durable import fsync_folder, fsync_path, inherit, unwritable
-from geodelreg.product.private import PrivateFolder, private_path
-from geodelreg.product.sidecars import belongs
-from geodelreg.product.targets import STDOUT, Inputs, check_replaceable
+from geodelreg.geotiff import journal, undo
+from geodelreg.geotiff.durable import fsync_folder, fsync_path, inherit, unwritable
+from geodelreg.geotiff.private import PrivateFolder, private_path
+from geodelreg.geotiff.sidecars import belongs
+from geodelreg.geotiff.targets import STDOUT, Inputs, check_replaceable
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.errors import LossyOutputError
-from geodelreg.product.copying import copy_range
-from geodelreg.product.durable import write_fully
+from geodelreg.geotiff.copying import copy_range
+from geodelreg.geotiff.durable import write_fully
 from geodelreg.tiff import (
     CLASSIC_LIMIT,
     LONG,

@@ -11,9 +11,9 @@ from xml.etree import ElementTree
 from affine import Affine
 
 from geodelreg.door.opening import open_raster, own_name
-from geodelreg.product import metadata, sidecars
-from geodelreg.product.header import Provenance
-from geodelreg.product.srs import SpatialReference, vrt_of
+from geodelreg.geotiff import metadata, sidecars
+from geodelreg.geotiff.header import Provenance
+from geodelreg.geotiff.srs import SpatialReference, vrt_of
 
 
 @contextmanager

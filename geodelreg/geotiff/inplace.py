@@ -22,15 +22,15 @@ from geodelreg.errors import (
     RasterNotFoundError,
     UnsafeInPlaceError,
 )
-from geodelreg.product import compare, metadata, relayout, sidecars, undo
-from geodelreg.product.atomic import exclusive, together
-from geodelreg.product.durable import unwritable
-from geodelreg.product.environment import gdal_session
-from geodelreg.product.geotiff import check_source
-from geodelreg.product.header import Georeference, Provenance, corrected_entries
-from geodelreg.product.srs import SpatialReference, is_kept_in_pam, spatial_reference
-from geodelreg.product.tiffwrite import appended_directory, fits, new_pointer
-from geodelreg.product.undo import Edit, SidecarChange, State
+from geodelreg.geotiff import compare, metadata, relayout, sidecars, undo
+from geodelreg.geotiff.atomic import exclusive, together
+from geodelreg.geotiff.corrected import check_source
+from geodelreg.geotiff.durable import unwritable
+from geodelreg.geotiff.environment import gdal_session
+from geodelreg.geotiff.header import Georeference, Provenance, corrected_entries
+from geodelreg.geotiff.srs import SpatialReference, is_kept_in_pam, spatial_reference
+from geodelreg.geotiff.tiffwrite import appended_directory, fits, new_pointer
+from geodelreg.geotiff.undo import Edit, SidecarChange, State
 from geodelreg.tiff import TiffFile, is_tiff
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Correction

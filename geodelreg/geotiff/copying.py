@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from geodelreg.errors import RasterNotFoundError, RasterUnreadableError
-from geodelreg.product.durable import write_fully
+from geodelreg.geotiff.durable import write_fully
 
 _CHUNK = 1 << 23
 _NOT_BY_KERNEL = (errno.EXDEV, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBADF)

@@ -20,11 +20,6 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.geo.pixel import pixel_centres
-from geodelreg.image.environment import gdal_calls
-from geodelreg.image.inputs import Opened
-from geodelreg.image.opening import dataset_grid
-from geodelreg.image.quality import hidden_values, impossible_values
-from geodelreg.image.validity import alpha_bands
 from geodelreg.masking import (
     AUTO,
     BINARY,
@@ -34,6 +29,11 @@ from geodelreg.masking import (
     is_old_landsat,
     quality_bands,
 )
+from geodelreg.raster.environment import gdal_calls
+from geodelreg.raster.inputs import Opened
+from geodelreg.raster.opening import dataset_grid
+from geodelreg.raster.quality import hidden_values, impossible_values
+from geodelreg.raster.validity import alpha_bands
 from geodelreg.values.raster import BoolArray, FloatArray, Grid, IntArray, Window
 
 _TOUCH_PX = 1e-3

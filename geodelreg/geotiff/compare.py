@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, RasterUnreadableError
 from geodelreg.geo.affine import affine_matrix
-from geodelreg.product.header import Provenance
-from geodelreg.product.metadata import attribute, colormap, lost_metadata
+from geodelreg.geotiff.header import Provenance
+from geodelreg.geotiff.metadata import attribute, colormap, lost_metadata
 
 _WINDOW_BYTES = 16_000_000
 _ATTRIBUTES = {

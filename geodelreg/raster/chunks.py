@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 KEPT_BYTES = 32_000_000
-"""Half of what the cache of GDAL has (`geodelreg.image.environment`), which decodes beneath."""
+"""Half of what the cache of GDAL has (`geodelreg.raster.environment`), which decodes beneath."""
 
 Fetch = Callable[[int, slice, slice], Any]
 """Pixels (h, w) of one band, counted from 0, of some rows and columns."""

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from affine import Affine
 
-from geodelreg.product.sidecars import DOMAIN
+from geodelreg.geotiff.sidecars import DOMAIN
 from geodelreg.tiff import ASCII, DOUBLE, Directory, Entry, Layout, TiffFile
 from geodelreg.values.points import Gcp
 

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import OutputUnwritableError
-from geodelreg.product import sidecars
+from geodelreg.geotiff import sidecars
 
 _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
 _SRS = re.compile(r"<VRTDataset\b[^>]*>\s*(<SRS\b.*?</SRS>)", re.DOTALL)

@@ -14,13 +14,13 @@ from geodelreg.door.formats import FORMATS, needed_for
 from geodelreg.door.names import LOCAL, is_encodable, refuse
 from geodelreg.door.opening import allowed, open_raster
 from geodelreg.errors import LossyOutputError, OutputUnwritableError, UsageError
+from geodelreg.geotiff import compare, metadata, sidecars
+from geodelreg.geotiff.environment import gdal_failures
+from geodelreg.geotiff.header import Provenance, merged_domains
+from geodelreg.geotiff.tiffwrite import edit_private, is_tiled
+from geodelreg.geotiff.view import corrected_view
 from geodelreg.masking import flag_bands
 from geodelreg.options import PansharpenOptions, WriteOptions
-from geodelreg.product import compare, metadata, sidecars
-from geodelreg.product.environment import gdal_failures
-from geodelreg.product.header import Provenance, merged_domains
-from geodelreg.product.tiffwrite import edit_private, is_tiled
-from geodelreg.product.view import corrected_view
 from geodelreg.tiff import is_tiff
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-from geodelreg.product.copying import copy_file
+from geodelreg.geotiff.copying import copy_file
 
 if TYPE_CHECKING:
     from affine import Affine

@@ -6,7 +6,7 @@
     files/     what will be put into place
     replaced/  what was there before
     scratch/   drafts
-    plan       what is to be done (see `geodelreg.product.journal`)
+    plan       what is to be done (see `geodelreg.geotiff.journal`)
     commit     it is to be done, not taken back
 
 Folders come with archives, and other users make them where all may write.  So one that was there
@@ -26,8 +26,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from geodelreg.errors import FileLockedError, OutputUnwritableError
-from geodelreg.product.durable import unwritable
-from geodelreg.product.sidecars import belongs
+from geodelreg.geotiff.durable import unwritable
+from geodelreg.geotiff.sidecars import belongs
 
 if sys.platform != "win32":
     import errno

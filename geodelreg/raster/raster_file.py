@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from geodelreg.door.names import is_local
 from geodelreg.errors import RasterUnreadableError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.image.decimate import BoxAverage, Share
-from geodelreg.image.environment import PIECES_BYTES, gdal_calls, passing_through
-from geodelreg.image.fill import undeclared_fill
-from geodelreg.image.inputs import Opened
-from geodelreg.image.overviews import Placement, find_placement
-from geodelreg.image.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.masking import quality_bands
+from geodelreg.raster.decimate import BoxAverage, Share
+from geodelreg.raster.environment import PIECES_BYTES, gdal_calls, passing_through
+from geodelreg.raster.fill import undeclared_fill
+from geodelreg.raster.inputs import Opened
+from geodelreg.raster.overviews import Placement, find_placement
+from geodelreg.raster.validity import alpha_bands, bands_with_mask, differs_from_nodata
 from geodelreg.values.raster import BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geodelreg.errors import UnsafeInPlaceError
-from geodelreg.product import undo
-from geodelreg.product.durable import fsync_folder, fsync_path, unwritable
-from geodelreg.product.private import PrivateFolder, private_path
-from geodelreg.product.sidecars import belongs
+from geodelreg.geotiff import undo
+from geodelreg.geotiff.durable import fsync_folder, fsync_path, unwritable
+from geodelreg.geotiff.private import PrivateFolder, private_path
+from geodelreg.geotiff.sidecars import belongs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

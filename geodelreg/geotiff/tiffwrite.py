@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from geodelreg.product import relayout
-from geodelreg.product.copying import Unchanged, copy_range, open_source
-from geodelreg.product.durable import write_fully
-from geodelreg.product.header import Georeference, Metadata, Provenance, corrected_entries
+from geodelreg.geotiff import relayout
+from geodelreg.geotiff.copying import Unchanged, copy_range, open_source
+from geodelreg.geotiff.durable import write_fully
+from geodelreg.geotiff.header import Georeference, Metadata, Provenance, corrected_entries
 from geodelreg.tiff import (
     CLASSIC_LIMIT,
     Entry,

@@ -6,8 +6,8 @@ import logging
 from pathlib import PurePath
 
 from geodelreg.errors import NoDataError
-from geodelreg.image.reader import RasterReader
 from geodelreg.masking import MaskUse
+from geodelreg.raster.reader import RasterReader
 
 logger = logging.getLogger(__name__)
 

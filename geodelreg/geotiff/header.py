@@ -14,9 +14,9 @@ from affine import Affine
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import RasterUnreadableError
-from geodelreg.product import geotags, sidecars
-from geodelreg.product.environment import gdal_failures
-from geodelreg.product.srs import SpatialReference, spatial_reference
+from geodelreg.geotiff import geotags, sidecars
+from geodelreg.geotiff.environment import gdal_failures
+from geodelreg.geotiff.srs import SpatialReference, spatial_reference
 from geodelreg.tiff import DOUBLE, SHORT, Directory, Entry, Layout, TiffFile, replaced
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Correction
