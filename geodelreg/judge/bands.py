@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import combinations
@@ -14,23 +14,20 @@ from affine import Affine
 from geodelreg.coarse.correlation import best_shift
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.matching import BandPass, match_band, match_bands
-from geodelreg.fine.overlay import Overlay, overlay
-from geodelreg.fine.passes import COARSE_SIGMA, Refinement
-from geodelreg.fine.surface import make_surface
-from geodelreg.fine.tiles import overview_tile
-from geodelreg.fine.tuning import surface_sigma
+from geodelreg.fine.overlay import Overlay
+from geodelreg.fine.passes import Refinement
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.judge.words import lies
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
-from geodelreg.values.raster import BoolArray, Float32Array
+from geodelreg.values.raster import Band, Float32Array
 
 _BAND_SHARE = 0.5
 """Of the patches that the best band matches: bands that match fewer have no say."""
 _SURE_SIGMAS = 3.0
-_CLEARLY = 0.97
-"""Of the unexplained detail: bands that were moved have 0.86 and less, others 1.00 and more."""
+_CLEARLY = 0.9
+"""Of the unexplained detail: bands that were moved have 0.75 and less, others 0.96 and more."""
 _DETAIL_PX = 2.0
 """Of the overview: only detail finer than this tells one place from the next."""
 _ALL_VALID = 0.99  # share of a pixel that was resampled; the rest is rounding
@@ -54,7 +51,7 @@ class BandsApart:
     words: str = ""
 
 
-def bands_apart(found: Sequence[BandPass], pair: Pair, moved: set[int] | None = None) -> BandsApart:
+def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
     """How far apart two bands put the ground by themselves, beyond their standard errors.
 
     The detectors of a pushbroom sensor see a place one band after the other, from slightly
@@ -67,29 +64,70 @@ def bands_apart(found: Sequence[BandPass], pair: Pair, moved: set[int] | None = 
     found : sequence of BandPass
         Each of one band alone.
     pair : Pair
-    moved : set of int, optional
-        One of the two bands is among these.
     """
+    return next(_furthest(_heard(found), pair), (BandsApart(), 0, 0))[0]
+
+
+def ground_apart(
+    found: Sequence[BandPass], guess: Guess, pair: Pair, least_px: float
+) -> BandsApart:
+    """The same of the ground alone: two bands that look like each other where they say they lie.
+
+    A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
+    place than its own.  So two bands are believed when each explains clearly more of the other's
+    detail once it is moved to where both find the same ground.
+
+    Parameters
+    ----------
+    found : sequence of BandPass
+        Each of one band alone, few matches or many.
+    guess : Guess
+        With the images that are looked at.
+    pair : Pair
+    least_px : float
+        MS pixels: bands that are no further apart are not looked at.
+    """
+    images = guess.images.source
+    step = ~images[0].grid.transform @ pair.source.grid.transform
     at = pair.source_centre
-    maps = [(p.band, p.found.estimate.map) for p in _heard(found) if p.found.estimate is not None]
+    places = {p.band: p.found.estimate.map.forward(at)[0] for p in found if p.found.estimate}
+
+    def unexplained(one: int, other: int) -> float:
+        move = places[other] - places[one]
+        back = (float(move[0] * step.a), float(move[1] * step.e))
+        here = _unexplained(images[one], images[other], (0.0, 0.0))
+        return _unexplained(images[one], images[other], back) / here if here > 0 else 1.0
+
+    for apart, one, other in _furthest(found, pair):
+        if apart.distance_px <= least_px:
+            break
+        if max(unexplained(one, other), unexplained(other, one)) < _CLEARLY:
+            return apart
+    return BandsApart()
+
+
+def _furthest(found: Sequence[BandPass], pair: Pair) -> Iterator[tuple[BandsApart, int, int]]:
+    """All pairs of bands that are apart beyond their standard errors, the furthest first."""
+    at = pair.source_centre
+    maps = [(p.band, p.found.estimate.map) for p in found if p.found.estimate is not None]
     if len(maps) < 2:
-        return BandsApart()
+        return
     places = np.concatenate([m.forward(at) for _, m in maps])
-    sigmas = [float(m.sigma_at(at)[0]) for _, m in maps]
+    sigmas = np.array([float(m.sigma_at(at)[0]) for _, m in maps])
     odd = np.hypot(*(places - np.median(places, axis=0)).T)
-    best = BandsApart()
-    for one, other in combinations(np.argsort(odd, kind="stable").tolist(), 2):
-        gap = float(np.hypot(*(places[one] - places[other])))
-        sure = gap - _SURE_SIGMAS * float(np.hypot(sigmas[one], sigmas[other]))
-        counts = moved is None or maps[one][0] in moved or maps[other][0] in moved
-        if counts and sure > best.distance_px:
-            # content that lies further right comes, at one pixel, from further left
-            there, here = pair.header.forward(places[[other, one]])
-            names = [
-                pair.source.band_names[pair.source_bands[maps[n][0]] - 1] for n in (one, other)
-            ]
-            best = BandsApart(sure, f"{names[1]} {lies(here - there, names[0])}")
-    return best
+    pairs = np.array(list(combinations(np.argsort(odd, kind="stable").tolist(), 2)))
+    gaps = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)
+    sure = gaps - _SURE_SIGMAS * np.hypot(*sigmas[pairs].T)
+    for number in np.argsort(-sure, kind="stable"):
+        if sure[number] <= 0:
+            return
+        one, other = pairs[number]
+        # content that lies further right comes, at one pixel, from further left
+        there, here = pair.header.forward(places[[other, one]])
+        bands = maps[one][0], maps[other][0]
+        names = [pair.source.band_names[pair.source_bands[band] - 1] for band in bands]
+        words = f"{names[1]} {lies(here - there, names[0])}"
+        yield BandsApart(float(sure[number]), words), *bands
 
 
 def _heard(found: Sequence[BandPass]) -> list[BandPass]:
@@ -135,73 +173,21 @@ def _start(guess: Guess, pair: Pair, band: int, heard: set[int]) -> AffineMap | 
     return AffineMap(Affine.translation(-shift[0] * step.a, -shift[1] * step.e))
 
 
-def really_elsewhere(
-    found: Sequence[BandPass], guess: Guess, refined: Refinement, correction: PixelMap
-) -> set[int]:
-    """Bands that all the others, PAN too, explain clearly better when they are moved back.
-
-    A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
-    place than its own; moved there it is explained worse, for each of the others has a weight of
-    its own and either sign.
-
-    Parameters
-    ----------
-    found : sequence of BandPass
-    guess : Guess
-        With the images that are looked at.
-    refined : Refinement
-    correction : PixelMap
-        The common one.
-
-    Returns
-    -------
-    set of int
-        Their `BandPass.band`.
-    """
-    part, images = refined.part, guess.images
-    centre = part.pair.source_centre
-    step = ~images.source[0].grid.transform @ part.pair.source.grid.transform
-    shown = [np.asarray(band.data, np.float32) for band in images.source]
-    valid = np.logical_and.reduce([band.valid for band in images.source])
-    if part.ms_is_template:
-        sigma = surface_sigma(part, overview_tile(part, images), COARSE_SIGMA)
-        surface = make_surface(images.reference, part.surface.grid, sigma)
-        seen = overlay(part, images.source[0], surface, correction)
-        shown.append(seen.surface)
-        valid &= seen.valid
-
-    def gain(near: BandPass) -> float:
-        if near.found.estimate is None:
-            return 1.0
-        move = (correction.forward(centre) - near.found.estimate.map.forward(centre))[0]
-        back = (float(move[0] * step.a), float(move[1] * step.e))
-        here = _unexplained(shown, valid, near.band, (0.0, 0.0))
-        return _unexplained(shown, valid, near.band, back) / here if here > 0 else 1.0
-
-    return {near.band for near in found if gain(near) < _CLEARLY}
-
-
-def _unexplained(
-    shown: Sequence[Float32Array],
-    valid: BoolArray,
-    band: int,
-    moved: tuple[float, float],
-) -> float:
-    """Share of a band's detail that the others do not explain, when it is read (x, y) further."""
-    height, width = valid.shape
+def _unexplained(one: Band, other: Band, moved: tuple[float, float]) -> float:
+    """Share of one band's detail, read (x, y) further, that the other does not explain."""
+    height, width = one.valid.shape
     matrix = np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]])
     how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    there = cv2.warpAffine(shown[band], matrix, (width, height), flags=how)
-    usable = cv2.warpAffine(valid.astype(np.float32), matrix, (width, height), flags=how)
+    there = cv2.warpAffine(np.asarray(one.data, np.float32), matrix, (width, height), flags=how)
+    usable = cv2.warpAffine(one.valid.astype(np.float32), matrix, (width, height), flags=how)
     window = np.ones((2 * round(3 * _DETAIL_PX) + 1,) * 2, dtype=np.uint8)
-    inner = cv2.erode((valid & (usable > _ALL_VALID)).astype(np.uint8), window) > 0
+    inner = cv2.erode((other.valid & (usable > _ALL_VALID)).astype(np.uint8), window) > 0
     if not inner.any():
         return 1.0
-    others = np.stack([_detail(one)[inner] for n, one in enumerate(shown) if n != band])
-    target = _detail(np.asarray(there, np.float32))[inner]
-    weights = np.linalg.lstsq(others @ others.T, others @ target, rcond=None)[0]
-    energy = float((target**2).sum())
-    return float(((target - weights @ others) ** 2).sum()) / energy if energy > 0 else 1.0
+    mine = _detail(np.asarray(there, np.float32))[inner]
+    theirs = _detail(np.asarray(other.data, np.float32))[inner]
+    energy = float(mine @ mine) * float(theirs @ theirs)
+    return 1.0 - float(mine @ theirs) ** 2 / energy if energy > 0 else 1.0
 
 
 def _detail(image: Float32Array) -> Float32Array:

@@ -17,7 +17,7 @@ from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
-from geodelreg.judge.bands import bands_apart, find_bands, really_elsewhere
+from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
 from geodelreg.judge.in_place import area_evidence
 from geodelreg.judge.rival import rival_correlation
 from geodelreg.judge.verdict import Evidence
@@ -59,10 +59,8 @@ def gather(
     with ThreadPoolExecutor(pair.threads) as pool:
         whole = pool.submit(overlaid)
         bands = find_bands(guess, refined, correction, pool)
-        apart = told = bands_apart(bands, pair)
-        if told.distance_px * pair.pan_px_per_source_px > BANDS_TOLD_PX:
-            moved = really_elsewhere(bands, guess, refined, correction)
-            told = bands_apart(bands, pair, moved)
+        apart = bands_apart(bands, pair)
+        told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)

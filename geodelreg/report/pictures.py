@@ -25,7 +25,7 @@ _MARGIN_PX = 3.0
 _STRETCH_PERCENT = (1.0, 99.0)
 _MIDDLE_GREY, _MEDIANS = 0.42, (0.05, 0.7)
 """The median becomes a middle grey: under bright clouds the ground stays to be seen."""
-_TINT = np.array([1.0, 0.93, 0.74])
+_TINT = np.array([1.0, 0.93, 0.74], np.float32)
 """Of a single band of MS, which is told from PAN by it."""
 _EMPTY = 38
 """Grey of what shows nothing."""
@@ -201,9 +201,9 @@ def _middle(data: Float32Array, valid: BoolArray) -> float:
     return float(np.median(data[valid])) if valid.any() else 0.0
 
 
-def _stretched(data: Float32Array, valid: BoolArray) -> FloatArray:
+def _stretched(data: Float32Array, valid: BoolArray) -> Float32Array:
     """(B, H, W) values as 0 … 1, each band by its percentiles; NaN where not valid."""
-    out = np.full(data.shape, np.nan)
+    out = np.full(data.shape, np.nan, np.float32)
     for band, image in zip(data, out, strict=True):
         if valid.any():
             low, high = np.percentile(band[valid], _STRETCH_PERCENT)
@@ -213,11 +213,11 @@ def _stretched(data: Float32Array, valid: BoolArray) -> FloatArray:
     return out
 
 
-def _coloured(image: FloatArray) -> Picture:
+def _coloured(image: Float32Array) -> Picture:
     return _picture(image if len(image) == 3 else image * _TINT[:, None, None])
 
 
-def _as_soft_as_ms(pan: FloatArray, pixels: float) -> FloatArray:
+def _as_soft_as_ms(pan: Float32Array, pixels: float) -> Float32Array:
     """PAN averaged to MS pixels of so many of its own: what only PAN resolves is no fringe."""
     sigma = _PIXEL_SIGMA * pixels
     if sigma < _PIXEL_SIGMA:
@@ -226,7 +226,7 @@ def _as_soft_as_ms(pan: FloatArray, pixels: float) -> FloatArray:
     return np.where(known, _blurred(pan, known, sigma), np.nan)
 
 
-def _over(pan: FloatArray, ms: FloatArray) -> Picture:
+def _over(pan: Float32Array, ms: Float32Array) -> Picture:
     """PAN orange, MS blue, as bright as each other; half of each in green keeps the sum grey.
 
     Only what changes over less than a `_BROAD` part of the picture counts: fields may be bright in
@@ -244,7 +244,7 @@ def _over(pan: FloatArray, ms: FloatArray) -> Picture:
     return _picture(np.stack([pan, (pan + grey) / 2, grey]))
 
 
-def _blurred(image: FloatArray, known: BoolArray, sigma: float) -> FloatArray:
+def _blurred(image: Float32Array, known: BoolArray, sigma: float) -> Float32Array:
     """Mean around each pixel of what is known there; broad ones are made of averages of pixels."""
     height, width = image.shape
     step = max(1, int(sigma / _FINEST_SIGMA))
@@ -261,7 +261,7 @@ def _blurred(image: FloatArray, known: BoolArray, sigma: float) -> FloatArray:
     return np.asarray(cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
-def _picture(planes: Sequence[Any] | FloatArray) -> Picture:
+def _picture(planes: Sequence[Any] | Float32Array) -> Picture:
     image = np.asarray(planes)
     image = np.where(np.isfinite(image).all(axis=0), 255 * image, _EMPTY)
     return np.ascontiguousarray(np.round(image).astype(np.uint8).transpose(1, 2, 0))

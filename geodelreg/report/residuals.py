@@ -12,6 +12,8 @@ from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 NEIGHBOURS = 8
 """Points whose median is taken: three gross mismatches among them change little."""
 _CELLS = 48
+_DISTANCES = 200_000
+"""Between places and points, held at once: 3 MB."""
 _REACH = 2.5
 """Usual distances between neighbours beyond which nothing is said of a place."""
 
@@ -53,13 +55,18 @@ def local_residual(points: TiePoints, at: FloatArray) -> tuple[FloatArray, Float
 
 def _neighbours(points: TiePoints, at: FloatArray) -> tuple[IntArray, FloatArray]:
     """(N, K) the matched points nearest to some places, and (N,) how far the farthest is."""
-    from scipy.spatial import cKDTree
-
     some = np.flatnonzero(matched(points))
     count = min(NEIGHBOURS, len(some))
-    distance, index = cKDTree(points.reference_px[some]).query(at, count)
-    near = some[np.reshape(index, (len(at), count))]
-    return np.asarray(near), np.reshape(distance, (len(at), count))[:, -1]
+    near, distance = np.empty((len(at), count), np.intp), np.empty(len(at))
+    # all distances, some places at a time: a tree would cost the import of scipy.spatial, 0.3 s
+    rows = max(1, _DISTANCES // len(some))
+    for start in range(0, len(at), rows):
+        part = slice(start, start + rows)
+        squared = ((at[part, None] - points.reference_px[some]) ** 2).sum(axis=-1)
+        order = np.argpartition(squared, count - 1, axis=1)[:, :count]
+        near[part] = some[order]
+        distance[part] = np.sqrt(np.take_along_axis(squared, order, axis=1).max(axis=1))
+    return near, distance
 
 
 def cells(frame: Frame) -> FloatArray:

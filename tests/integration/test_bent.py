@@ -9,8 +9,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import rasterio
 from affine import Affine
 from numpy.typing import NDArray
+from rasterio.windows import Window
 
 import geodelreg
 from benchmarks.gate.bent_cases import BentPair
@@ -25,6 +27,7 @@ from geodelreg.values.result import CheckOutcome
 
 SHAPE = (640, 640)
 SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=2.0)
+SAMPLE = Path(__file__).parents[2] / "sample_tiles"
 CLOUDY = replace(SPEC, name="cloudy 1", variant="clouds")
 
 
@@ -163,6 +166,35 @@ def test_bands_that_lie_a_little_apart_are_warned_of(tmp_path: Path) -> None:
     apart = bands_apart(tmp_path, (0.6, -0.5))
     alignment = geodelreg.align(apart.ms, apart.pan)
     assert any("MS bands do not agree: band 3" in warning for warning in alignment.warnings)
+
+
+def test_bands_that_lie_apart_two_by_two_are_refused(tmp_path: Path) -> None:
+    still, shift = (0.0, 0.0), (3.0, -4.0)
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=(still, still, shift, shift))
+    error, alignment = refusal(written(tmp_path, BentPair(scene)))
+    assert "bands" in failed(alignment)
+    assert "3 px left and 4 px down of band" in str(error)
+
+
+@pytest.mark.parametrize("start", [(64, 248), (60, 256)])
+def test_a_band_that_looks_unlike_the_others_is_not_called_misaligned(
+    start: tuple[int, int], tmp_path: Path
+) -> None:
+    ms, pan = tmp_path / "ms.tif", tmp_path / "pan.tif"
+    crop(SAMPLE / "pan.tif", pan, start, 440)
+    crop(SAMPLE / "ms.tif", ms, (start[0] // 4, start[1] // 4), 110)
+    alignment = geodelreg.align(ms, pan)
+    assert alignment.verdict.accepted
+    assert not any("bands do not agree" in warning for warning in alignment.warnings)
+
+
+def crop(source: Path, target: Path, start: tuple[int, int], side: int) -> None:
+    with rasterio.open(source) as raster:
+        window = Window(*start, side, side)
+        transform = raster.transform @ Affine.translation(*start)
+        how = {"count": raster.count, "dtype": "uint16", "crs": raster.crs, "transform": transform}
+        with rasterio.open(target, "w", "GTiff", side, side, **how) as out:
+            out.write(raster.read(window=window))
 
 
 def bands_apart(folder: Path, shift: tuple[float, float]) -> Made:
