@@ -22,6 +22,8 @@ from geodelreg.values.result import Alignment
 _LATTICE = 17
 """Places along an axis where headers are asked; between them their curve is no part of a pixel."""
 _MARGIN_PX = 3.0
+_TOGETHER = 1.5
+"""Of a part of MS: before and after are read as one where that is not much more."""
 _STRETCH_PERCENT = (1.0, 99.0)
 _MIDDLE_GREY, _MEDIANS = 0.42, (0.05, 0.7)
 """The median becomes a middle grey: under bright clouds the ground stays to be seen."""
@@ -87,8 +89,7 @@ class Pictures:
         """The pictures of a window of PAN, averaged down to `shape`."""
         band = self._pan.read([self._pan_band], window, shape)[0]
         pan = _stretched(band.data[None], band.valid)[0]
-        pixels = [self._ms_on(window, shape, corrected) for corrected in (False, True)]
-        shown = [_stretched(data, valid) for data, valid in pixels]
+        shown = [_stretched(data, valid) for data, valid in self._ms_on(window, shape)]
         soft = _as_soft_as_ms(pan, self._frame.pan_px_per_ms_px * shape[1] / window.width)
         overs = [_over(soft, image) for image in shown]
         before, after = map(_coloured, shown)
@@ -97,50 +98,74 @@ class Pictures:
     def bands(self, window: Window, shape: tuple[int, int]) -> tuple[Band, Band, Band]:
         """PAN, and one band of MS as delivered and corrected, on one grid."""
         pan = self._pan.read([self._pan_band], window, shape)[0]
-        (before, seen), (after, seen_after) = (
-            self._ms_on(window, shape, corrected) for corrected in (False, True)
-        )
+        (before, seen), (after, seen_after) = self._ms_on(window, shape)
         name = self.shown
         return (
             pan, Band(before[0], seen, pan.grid, name), Band(after[0], seen_after, pan.grid, name),
         )  # fmt: skip
 
     def _ms_on(
-        self, window: Window, shape: tuple[int, int], corrected: bool
-    ) -> tuple[Float32Array, BoolArray]:
-        """(B, H, W) MS on the pixels of a PAN window, and where it is valid."""
-        nothing = np.zeros((len(self._bands), *shape), np.float32), np.zeros(shape, np.bool_)
-        at = self._positions(window, shape, corrected)
-        known = at[np.isfinite(at).all(axis=-1)]
-        part = window_around(known, _MARGIN_PX, self._ms.grid) if len(known) else None
-        if part is None:
-            return nothing
-        spread = np.maximum(np.ptp(known, axis=0), 1.0)
-        step = np.maximum(spread / shape[::-1], 1.0)
-        size = np.maximum(np.round(np.array(part[2:]) / step), 1).astype(int)
-        bands = self._ms.read(list(self._bands), part, (int(size[1]), int(size[0])))
-        local = corner_to_centre((at - part[:2]) * size / np.array(part[2:]))
-        x, y = np.nan_to_num(local, nan=-10.0).astype(np.float32).transpose(2, 0, 1)
-        valid = np.logical_and.reduce([band.valid for band in bands]).astype(np.float32)
-        data = [
-            cv2.remap(
-                np.where(valid > 0, band.data, _middle(band.data, valid > 0)).astype(np.float32),
-                x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
-            )
-            for band in bands
-        ]  # fmt: skip
-        share = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return np.stack(data), np.asarray(share > 0.5)
+        self, window: Window, shape: tuple[int, int]
+    ) -> list[tuple[Float32Array, BoolArray]]:
+        """(B, H, W) MS as delivered and corrected on a PAN window, and where it is valid."""
+        lattices = [self._lattice(window, corrected) for corrected in (False, True)]
+        parts = [self._around(lattice) for lattice in lattices]
+        both = self._around(np.concatenate(lattices))
+        if None not in parts and both is not None:
+            smaller = min(part.width * part.height for part in parts if part is not None)
+            if both.width * both.height <= _TOGETHER * smaller:
+                parts = [both, both]
+        read: dict[Window, list[Band]] = {}
+        out = []
+        for part, lattice in zip(parts, lattices, strict=True):
+            if part is None:
+                nothing = np.zeros((len(self._bands), *shape), np.float32)
+                out.append((nothing, np.zeros(shape, np.bool_)))
+                continue
+            if part not in read:
+                read[part] = self._read(part, lattice, shape)
+            out.append(_sampled(read[part], part, lattice, shape))
+        return out
 
-    def _positions(self, window: Window, shape: tuple[int, int], corrected: bool) -> FloatArray:
-        """(H, W, 2) MS pixels, outer corner, of the pixels of a PAN window of some shape."""
+    def _around(self, lattice: FloatArray) -> Window | None:
+        known = lattice[np.isfinite(lattice).all(axis=-1)]
+        return window_around(known, _MARGIN_PX, self._ms.grid) if len(known) else None
+
+    def _read(self, part: Window, lattice: FloatArray, shape: tuple[int, int]) -> list[Band]:
+        """A window of MS, averaged down until its pixels are about those of the picture."""
+        spread = np.maximum(np.nanmax(lattice, axis=(0, 1)) - np.nanmin(lattice, axis=(0, 1)), 1.0)
+        step = np.maximum(spread / shape[::-1], 1.0)
+        width, height = np.maximum(np.round(np.array(part[2:]) / step), 1).astype(int)
+        return self._ms.read(list(self._bands), part, (int(height), int(width)))
+
+    def _lattice(self, window: Window, corrected: bool) -> FloatArray:
+        """(n, n, 2) MS pixels, outer corner, of places from edge to edge of a PAN window."""
         rows, columns = (
             start + np.linspace(0.0, size, _LATTICE)
             for start, size in ((window.row, window.height), (window.column, window.width))
         )
-        lattice = self._frame.to_ms(np.stack(np.meshgrid(columns, rows), axis=-1), corrected)
-        down, across = (_between(count) for count in shape)
-        return np.asarray(np.einsum("yi,ijk,xj->yxk", down, lattice, across, optimize=True))
+        return self._frame.to_ms(np.stack(np.meshgrid(columns, rows), axis=-1), corrected)
+
+
+def _sampled(
+    bands: Sequence[Band], part: Window, lattice: FloatArray, shape: tuple[int, int]
+) -> tuple[Float32Array, BoolArray]:
+    """(B, H, W) what was read of a part of MS at the places that a lattice spans."""
+    size = np.array(bands[0].data.shape[::-1])
+    local = corner_to_centre((lattice - part[:2]) * size / np.array(part[2:]))
+    down, across = (_between(count) for count in shape)
+    at = np.einsum("yi,ijk,xj->kyx", down, local, across, optimize=True)
+    x, y = np.nan_to_num(at, nan=-10.0).astype(np.float32)
+    valid = np.logical_and.reduce([band.valid for band in bands]).astype(np.float32)
+    data = [
+        cv2.remap(
+            np.where(valid > 0, band.data, _middle(band.data, valid > 0)).astype(np.float32),
+            x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
+        )
+        for band in bands
+    ]  # fmt: skip
+    share = cv2.remap(valid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.stack(data), np.asarray(share > 0.5)
 
 
 def bands_to_show(ms: RasterReader, alignment: Alignment) -> tuple[int, ...]:
