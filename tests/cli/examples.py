@@ -1,0 +1,69 @@
+"""Runs the examples of a page of the documentation as they stand there.
+
+Blocks that are marked ``sh`` or ``python`` are examples. What needs more than a test has (a
+network, a cluster, other programs) is marked ``bash`` or ``py``, and what is printed ``text``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON = shlex.quote(sys.executable)
+PRELUDE = f"""set -e
+geodelreg() {{ {PYTHON} -m geodelreg_cli "$@"; }}
+rio() {{ {PYTHON} -c 'from rasterio.rio.main import main_group; main_group()' "$@"; }}
+dask() {{ exec {PYTHON} -m dask "$@"; }}
+"""
+
+
+def pages() -> list[str]:
+    """README and all pages, by their names in the repository."""
+    found = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return [page.relative_to(ROOT).as_posix() for page in found]
+
+
+def examples(page: str) -> list[tuple[str, str]]:
+    """Language and text of each example, in order."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(r"^```(sh|python)\n(.*?)^```", text, re.M | re.S)
+
+
+def run_examples(page: str, folder: Path, port: int) -> None:
+    """Run all examples of a page, one after the other.
+
+    Those in Python share one namespace, as in a session.
+
+    Parameters
+    ----------
+    page : str
+        Name in the repository.
+    folder : Path
+        Where they run, with the files that they name.
+    port : int
+        Of a cluster, in place of Dask's usual one.
+
+    Raises
+    ------
+    Exception
+        When one fails.
+    """
+    session: dict[str, Any] = {"__name__": "__main__"}
+    for language, text in examples(page):
+        block = text.replace("8786", str(port))
+        if language == "python":
+            with contextlib.chdir(folder):
+                exec(compile(block, page, "exec"), session)
+            continue
+        done = subprocess.run(
+            ["bash", "-m", "-c", PRELUDE + block], cwd=folder, capture_output=True, text=True,
+            timeout=300, env=os.environ | {"COLUMNS": "100"},
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
