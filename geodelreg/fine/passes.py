@@ -26,6 +26,7 @@ from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Overview, Status
+from geodelreg.values.raster import FloatArray
 
 COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
 _PASSES = 2
@@ -40,6 +41,9 @@ _FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
 _NEAR_HEADER_PX = 4.0
 _COARSE_FROM = 1.5  # times coarser than full resolution; unexplained: ablate
 _MUCH_VISIBLE = 0.75  # unexplained: ablate
+_MINORITY = 0.4
+"""Share of the patches that agree, below which the others may have spoilt the tone: a robust fit
+breaks down at half, and patches at the edge of what shows something hold some of the rest."""
 _BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.tuning` that is not usual
 
 
@@ -271,10 +275,25 @@ def _closely(
 ) -> Refinement | None:
     """The last pass, over all tiles."""
     near = found.estimate.map
-    tuning = replace(found.tuning, tone=fit_tone(part, tiles, near, found.tuning.sigma))
-    options = replace(options, iterations=_LAST_ITERATIONS)
+    tone = fit_tone(
+        part, tiles, near, found.tuning.sigma, agreed=_few_agreed(found.last, found.size)
+    )
+    tuning = replace(found.tuning, tone=tone)
+    options = replace(options, size=found.size, iterations=_LAST_ITERATIONS)
     last = match_pass(part, tiles, near, tuning, options)
     return None if last.estimate is None else Refinement(part, tiles, tuning, last, options.size)
+
+
+def _few_agreed(found: Pass, size: int) -> tuple[FloatArray, int] | None:
+    """Centres and side of the patches that agree, where these are a minority of the image."""
+    agreed = found.status == Status.KEPT
+    return (found.matched.template_px[agreed], size) if agreed.mean() < _MINORITY else None
+
+
+def _smaller(found: Pass, size: int) -> int:
+    """Side of a patch, for less area than was thought shows anything."""
+    textured = int((found.status != Status.TEXTURE).sum())
+    return min(size, patch_size(textured * size**2))
 
 
 def _approach(
@@ -282,9 +301,9 @@ def _approach(
 ) -> Refinement | None:
     """Passes towards the map and the point spread, from a start a few pixels off."""
     local = look.local_tone and part.ms_is_template
-    sigma, found = DEFAULT_SIGMA, None
+    sigma, found, few = DEFAULT_SIGMA, None, None
     for number in range(passes):
-        tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES)
+        tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES, few)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness
             agreed = found.matched.template_px[found.status == Status.KEPT]
@@ -293,6 +312,8 @@ def _approach(
         found = match_pass(part, tiles, near, tuning, options)
         if found.estimate is None:
             return None
-        near = found.estimate.map
+        near, few = found.estimate.map, _few_agreed(found, options.size)
+        if few is not None:
+            options = replace(options, size=_smaller(found, options.size))
     assert found is not None
     return Refinement(part, tiles, tuning, found, options.size)

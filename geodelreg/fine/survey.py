@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
+from geodelreg.fine.texture import noise_of, show_texture
 from geodelreg.fine.tiles import patch_size
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
 
@@ -20,13 +21,10 @@ REACH_PX = 22
 
 _BRIGHTEST_PERCENT = 95  # what a cloud covers of a patch that it moves, at the least
 _COLUMNS = 8  # of what is noted of a patch, below
-_LAPLACE = 6  # the norm of its kernel (Immerkær 1996)
 _MOST_R = 0.999  # below 1, where Fisher's transformation ends
 _ROUNDED_R = 1.001  # above 1 by rounding; what lies beyond is flat
 _LEAST_VALID = 0.8  # unexplained: ablate
 _CORRELATION_LENGTH_PX = 2.0
-_NOISE_SHARE = 0.6745  # unexplained: ablate
-_LARGEST_SIGMA_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +76,7 @@ def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
     surface = _filled(overlay.surface, overlay.surface_valid)
-    noise = _noise(template, overlay.template_valid)
+    noise = noise_of(template, overlay.template_valid)
     height, width = template.shape
     padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
     rows = []
@@ -99,35 +97,22 @@ def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
                     *(left + size / 2, top + size / 2),
                     *move,
                     *(scores[row, column], scores[reach, reach]),
-                    *(_sigma(patch, noise), float(np.percentile(patch, _BRIGHTEST_PERCENT))),
+                    *(
+                        show_texture(patch[None], noise)[0],
+                        np.percentile(patch, _BRIGHTEST_PERCENT),
+                    ),
                 ]
             )
     found = np.array(rows).reshape(-1, _COLUMNS)
     centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
-    score, here, sigma, brightest = rest
-    return Places(centre, move, score, here, sigma < _LARGEST_SIGMA_PX, brightest, size)
+    score, here, textured, brightest = rest
+    return Places(centre, move, score, here, textured > 0, brightest, size)
 
 
 def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:
     """The image less its mean, 0 where it is not valid."""
     level = np.float32(image[valid].mean()) if valid.any() else np.float32(0)
     return np.where(valid, image - level, np.float32(0)).astype(np.float32)
-
-
-def _noise(image: Float32Array, valid: BoolArray) -> float:
-    """Standard deviation of the pixels' noise, at most (Immerkær 1996, by the median)."""
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / _LAPLACE
-    rough = np.abs(cv2.filter2D(image, cv2.CV_32F, kernel))[valid]
-    return float(np.median(rough)) / _NOISE_SHARE if len(rough) else 0.0
-
-
-def _sigma(patch: Float32Array, noise: float) -> float:
-    """Standard error that least-squares matching could reach, along the worse axis, pixels."""
-    across = (patch[1:-1, 2:] - patch[1:-1, :-2]).ravel() / 2
-    down = (patch[2:, 1:-1] - patch[:-2, 1:-1]).ravel() / 2
-    xx, yy, xy = (float(v) for v in (across @ across, down @ down, across @ down))
-    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    return noise / float(np.sqrt(least)) if least > 0 else np.inf
 
 
 def _peak(scores: Float32Array, row: int, column: int) -> FloatArray:

@@ -126,6 +126,9 @@ def fit_synthetic_pan(bands: Float32Array, target: Float32Array) -> SyntheticPan
         fitted = _curved(products, linear, target - weights @ stack, weights * spread)
         if fitted is not None:
             curvature, weights = fitted[0], fitted[1] / spread
+            dark, bright = ((end - centre) / spread for end in (low, high))
+            least, most = _rising(fitted[0], fitted[1], dark, bright)
+            low, high = centre + spread * least, centre + spread * most
     return SyntheticPan(weights, centre, spread, low, high, curvature, correlation)
 
 
@@ -165,6 +168,26 @@ def _rises(curvature: FloatArray, weights: FloatArray, linear: FloatArray) -> bo
     bend[np.triu_indices(len(weights))] = curvature
     slopes = weights + linear @ (bend + bend.T)
     return bool(np.clip(-slopes, 0, None).sum() <= _MOST_FALLING * np.abs(slopes).sum())
+
+
+def _rising(
+    curvature: FloatArray, weights: FloatArray, dark: FloatArray, bright: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The part of the range, (B,) standardised bands each, over which the curvature brightens.
+
+    Few pixels may lie beyond, and yet hold most of the contrast: of clouds, or of an image shaded
+    like relief, both sides of a slope would look bright.
+    """
+    bend = np.zeros((len(weights), len(weights)))
+    bend[np.triu_indices(len(weights))] = curvature
+    # from the centre towards either end, the slope along the way changes evenly
+    slope = float(weights @ (bright - dark))
+    ends = []
+    for end in (dark, bright):
+        change = float(end @ (bend + bend.T) @ (bright - dark))
+        share = min(1.0, -slope / change) if change < 0 else 1.0
+        ends.append(max(share, 0.0) * end)
+    return ends[0], ends[1]
 
 
 def _is_worthwhile(design: FloatArray, target: FloatArray, plain: FloatArray) -> bool:

@@ -69,9 +69,18 @@ def decimation(band: Band, full: Grid) -> tuple[float, float]:
 
 
 def fit_tone(
-    part: Roles, tiles: list[Tile], correction: PixelMap, sigma: float, samples: int = _TONE_SAMPLES
+    part: Roles,
+    tiles: list[Tile],
+    correction: PixelMap,
+    sigma: float,
+    samples: int = _TONE_SAMPLES,
+    agreed: tuple[FloatArray, int] | None = None,
 ) -> SyntheticPan:
-    """Weights of the MS bands that reproduce PAN; the first band where none resembles it."""
+    """Weights of the MS bands that reproduce PAN; the first band where none resembles it.
+
+    Judged everywhere, or where patches agreed, whose (N, 2) centres and side are given: areas that
+    show something in one image alone have no tone.
+    """
     there, per_tile = part.to_surface(correction), max(samples // len(tiles), LEAST_SAMPLES)
 
     def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
@@ -81,6 +90,8 @@ def fit_tone(
         fine = [sample(surface, place) for surface in surfaces]
         good = np.logical_and.reduce([usable[:, 0] for _, usable in fine])
         good &= np.logical_and.reduce([band.valid[take] for band in tile.template])
+        if agreed is not None:
+            good &= _covered(part, tile.template[0], *agreed)[take]
         coarse = np.stack([band.data[take][good] for band in tile.template])
         smooth = np.stack([v[good, 0] + s.level for (v, _), s in zip(fine, surfaces, strict=True)])
         return (coarse, smooth[0]) if part.ms_is_template else (smooth, coarse[0])

@@ -19,7 +19,7 @@ from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
 from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
 from geodelreg.judge.in_place import area_evidence
-from geodelreg.judge.rival import rival_correlation
+from geodelreg.judge.rival import Rival, rival_correlation
 from geodelreg.judge.verdict import Evidence
 from geodelreg.judge.words import BANDS_TOLD_PX
 from geodelreg.pair import Pair
@@ -49,7 +49,7 @@ def gather(
     part, correction = refined.part, fitted.map
     pair = part.pair
 
-    def overlaid() -> tuple[Accuracy, float]:
+    def overlaid() -> tuple[Accuracy, Rival]:
         before, after, wide = _overlays(guess, refined, correction)
         accuracy = measure(part, fitted.points, fitted.selection, before, after)
         return accuracy, rival_correlation(wide)
@@ -73,7 +73,8 @@ def gather(
         coverage=accuracy.coverage,
         sigma_px=accuracy.sigma_corner_px,
         disagreement_px=fitted.disagreement_px,
-        rival=rival,
+        rival=rival.elsewhere,
+        shading=rival.beside,
         shift_px=float(np.hypot(*pair.move_px(correction, pair.source_centre)[0])),
         rotation_deg=abs(turn_deg),
         scale=scale,

@@ -9,13 +9,14 @@ import numpy as np
 from geodelreg.fine.least_squares import MIN_CORRELATION, MIN_VALID
 from geodelreg.fine.patches import Patches, cut_patches, sample_step
 from geodelreg.fine.surface import Surface, sample
+from geodelreg.fine.texture import noise_of, show_texture
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tuning import Tuning, tile_images
 from geodelreg.fit.chance import log10_binomial_tail
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import FloatArray, IntArray
+from geodelreg.values.raster import Band, BoolArray, FloatArray, IntArray
 
 _DISPLACED_RADII = (4.0, 9.0)  # patch pixels: beyond the texture's own width; unexplained: ablate
 _DIRECTIONS = 8  # at each radius: 16 places
@@ -77,9 +78,19 @@ def area_evidence(
         bands, surface = tile_images(part, tile, tuning)
         patches = cut_patches(bands, part.template.grid, size)
         chosen = np.arange(number % every, len(patches), every)
+        chosen = chosen[_textured(bands, patches.take(chosen))]
         scores = _explained(there, surface, patches, chosen, offsets)
         counts.append(best_in_place(scores))
     return AreaEvidence(*map(sum, zip(*counts, strict=True)))
+
+
+def _textured(bands: list[Band], patches: Patches) -> BoolArray:
+    """(P,) True for patches that show more than noise in any band."""
+    shape = (len(patches), patches.size, patches.size)
+    found = np.zeros(len(patches), dtype=np.bool_)
+    for band, values in zip(bands, patches.values.swapaxes(0, 1), strict=True):
+        found |= show_texture(values.reshape(shape), noise_of(band.data, band.valid))
+    return found
 
 
 def best_in_place(scores: FloatArray) -> AreaEvidence:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,18 +22,37 @@ _BLOCK_PX = 32  # of the image magnified twice
 _UNSUSPICIOUS = 0.5
 
 
-def rival_correlation(overlay: Overlay) -> float:
-    """Best correlation at another displacement over that in place; 0 to about 1.
+class Rival(NamedTuple):
+    """What else the images would fit, over the correlation in place.
 
-    Repeated texture (fields, waves, roofs) fits as well one period further: a value near 1 means
-    that the images alone cannot tell.  Rivals are the displacements at which the whole correlates
-    best; they are judged block by block, so that fields of inverted contrast do not cancel out.
-    Near the place a rival is one of opposite contrast, on one side only: where one image is shaded
-    like relief and the other is not, both sides of a slope fit as well, and neither is right.
+    Attributes
+    ----------
+    elsewhere : float
+        Best correlation at another displacement, 0 to about 1.  Repeated texture (fields, waves,
+        roofs) fits as well one period further: near 1 the images alone cannot tell.
+    beside : float
+        Best correlation of opposite contrast within a few pixels, on one side of the place only.
+        Where light falls differently, slopes are bright in one image as they face it, and flat
+        ground is in the other as it is: correlation changes its sign across the true place, which
+        is beside the one found.  Of images lit alike it is even around the place.
+    """
+
+    elsewhere: float
+    beside: float
+
+
+_UNKNOWN = Rival(float("nan"), float("nan"))
+
+
+def rival_correlation(overlay: Overlay) -> Rival:
+    """Correlation at other displacements over that in place.
+
+    Rivals are the displacements at which the whole correlates best; they are judged block by block,
+    so that fields of inverted contrast do not cancel out.
 
     Returns
     -------
-    float
+    Rival
         NaN when the overlay is too small or has no texture.
     """
     (one, one_mask), (other, other_mask) = detail_pair(overlay)
@@ -40,7 +60,7 @@ def rival_correlation(overlay: Overlay) -> float:
     small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
     common = float((one_mask * other_mask).sum())
     if small or common < _LEAST_COMMON:
-        return float("nan")
+        return _UNKNOWN
     signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
     scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
@@ -48,11 +68,12 @@ def rival_correlation(overlay: Overlay) -> float:
     here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
     in_place = float(here.max())
     if in_place <= 0:
-        return float("inf")
+        return Rival(float("inf"), float("inf"))
     near = np.s_[
         middle_y - _NEAR_PX : middle_y + _NEAR_PX + 1, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1
     ]
-    scores[near] = _one_sided(signed[near])
+    beside = float(_one_sided(signed[near]).max()) / in_place
+    scores[near] = 0.0
     rivals: list[float] = []
     by_block: Callable[[int, int], float] | None = None
     for _ in range(_RIVALS):
@@ -65,7 +86,7 @@ def rival_correlation(overlay: Overlay) -> float:
         in_blocks = by_block(middle_y - row, middle_x - column)
         rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
         scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
-    return max(rivals)
+    return Rival(max(rivals), beside)
 
 
 def _one_sided(signed: Float32Array) -> Float32Array:

@@ -26,6 +26,7 @@ _LIMITS = (
     ("sigma_px", "≤", 0.7, "PAN px standard error at the worst corner"),
     ("disagreement_px", "≤", 1.0, "PAN px between the correction and"),
     ("rival", "≤", 0.85, "relative correlation of the best rival place"),
+    ("shading", "≤", 0.3, "relative correlation of opposite contrast beside the place"),
     ("rival_motion", "≤", 0.67, "patches agree on another motion for each that agrees on this one"),
     ("support", "≥", 0.5, "share of the areas correlates best in place"),
     ("bands_apart", "≤", 0.5, "coarser px between the places of two MS bands, as of clouds"),
@@ -65,6 +66,8 @@ class Evidence:
         overlap; of other methods than ours, that from what dense patches around it say.
     rival : float
         Correlation at the best displaced place over that at the correction; near 1 = ambiguous.
+    shading : float
+        The same of opposite contrast, beside the place and on one side of it.
     shift_px, rotation_deg, scale : float
         Of the correction, for the limits the user gave.
     rival_motion : float
@@ -98,6 +101,7 @@ class Evidence:
     sigma_px: float
     disagreement_px: float
     rival: float
+    shading: float
     shift_px: float
     rotation_deg: float
     scale: float

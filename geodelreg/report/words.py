@@ -70,6 +70,10 @@ REASONS = {
     "sigma_px": ("Uncertainty at the worst corner", "Standard error of the correction there."),
     "disagreement_px": ("Halves agree", "Distance between fits to two halves of the points."),
     "rival": ("No rival place", "Likeness at the best other place over that at the found one."),
+    "shading": (
+        "Lit alike",
+        "Likeness of opposite contrast close beside the place, on one side alone.",
+    ),
     "rival_motion": (
         "No rival motion",
         "Patches that agree on another motion, for each that agrees on this one.",
@@ -108,6 +112,7 @@ FAILED = {
     "sigma_px": "The correction is too uncertain at the far corner.",
     "disagreement_px": "Two halves of the tie points tell different corrections.",
     "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
+    "shading": "Light falls differently on the two images: one is shaded like relief.",
     "rival_motion": "Nearly as many patches agree on another motion as on the one followed: a part "
     "that moves by itself, or a bend.",
     "support": "Too many areas look alike better elsewhere than in place.",

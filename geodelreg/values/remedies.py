@@ -36,7 +36,7 @@ _REMEDIES = (
         ),
     ),
     (
-        {"rival"},
+        {"rival", "shading"},
         (
             "The images fit elsewhere nearly as well: repeated texture, or one of them is shaded "
             "like relief. Try --band with the band that looks most like PAN, or a larger part of "

@@ -16,7 +16,7 @@ from rasterio.windows import Window
 
 import geodelreg
 from benchmarks.gate.bent_cases import BentPair
-from benchmarks.gate.distortions import Tear, gradient_contrast, relief_shading, waves
+from benchmarks.gate.distortions import Tear, fade, gradient_contrast, relief_shading, waves
 from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
 from geodelreg import Alignment, AlignOptions
@@ -138,7 +138,33 @@ def test_an_image_shaded_like_relief_has_two_places_and_is_refused(tmp_path: Pat
     scene = make_scene(SPEC, sample_imagery())
     shaded = replace(scene, ms=relief_shading(scene.ms, np.random.default_rng(3)))
     _, alignment = refusal(written(tmp_path, BentPair(shaded)))
-    assert "rival" in failed(alignment)
+    assert "shading" in failed(alignment)
+
+
+def test_a_shaded_image_is_refused_though_clipped_clouds_hold_most_of_its_contrast(
+    tmp_path: Path,
+) -> None:
+    scene = make_scene(SPEC, sample_imagery())
+    # the brightest fields saturate both sensors, as clouds do; the rest is dim
+    clipped = [
+        np.where(image > np.percentile(image, 96), 4095, 300 + image // 20).astype(np.uint16)
+        for image in (scene.ms, scene.pan)
+    ]
+    shaded = relief_shading(clipped[0], np.random.default_rng(3))
+    pair = BentPair(replace(scene, ms=shaded, pan=clipped[1]))
+    assert "shading" in failed(refusal(written(tmp_path, pair))[1])
+
+
+def test_a_scale_is_found_from_a_corner_that_shows_something(tmp_path: Path) -> None:
+    """All else is flat in MS, and must spoil neither the tone nor the share of what agrees."""
+    error = HeaderError((2.0, -1.2), (1.02, 0.0, 0.0, 1.02))
+    spec = replace(SPEC, error=error, ms_shape=(150, 150), ratio=4.0)
+    scene = make_scene(spec, sample_imagery())
+    fade(scene.ms, 0.44, np.random.default_rng(1))
+    corner = written(tmp_path, BentPair(scene))
+    alignment = geodelreg.align(corner.ms, corner.pan)
+    assert corner.rms_px(alignment.correction.corrected) < 0.2
+    assert alignment.accuracy.coverage < 0.2
 
 
 def test_a_few_patches_of_many_that_agree_are_chance(tmp_path: Path) -> None:
