@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fine.motions import neighbours
-from geodelreg.fit.chance import log10_signed_rank_tail
+from geodelreg.fit.chance import log10_signed_rank_tail, positive_rank_share
 from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
 _AMONG = 0.5
@@ -15,6 +15,10 @@ _AMONG = 0.5
 a part that is torn off has still neighbours along its edge alone."""
 _LOG_CHANCE = -2.0
 """Of patches that outshine their neighbours: one alarm in a hundred pairs that are bent."""
+_OUTSHINING = 0.75
+"""Share of the sum of ranks that patches which outshine their neighbours must hold: 0.85 to 0.96
+over clouds; of ground that is bent or torn a half, and 0.62 at most.  Many patches make chance
+unlikely where one end of a scene is a little brighter."""
 _PARALLAX_R2 = 0.65
 """Share of the motion that the bands' parallax must explain: 0.74 and 0.96 over real clouds, 0.43
 at most over ground, where unlike bands look different."""
@@ -34,15 +38,19 @@ class CloudLook:
     log_chance : float
         log10 of the probability that those would by chance be so much brighter than their still
         neighbours, each by its brightest pixels (signed ranks, Wilcoxon 1945).
+    outshining : float
+        Share of the sum of those ranks that is of patches brighter than their neighbours.
     """
 
     among: float = 0.0
     log_chance: float = 0.0
+    outshining: float = 0.0
 
     @property
     def explains(self) -> bool:
         """True when clouds are the better explanation than a bent or torn ground."""
-        return self.among >= _AMONG and self.log_chance <= _LOG_CHANCE
+        likely = self.log_chance <= _LOG_CHANCE and self.outshining >= _OUTSHINING
+        return likely and self.among >= _AMONG
 
 
 def cloud_look(xy: FloatArray, moves: BoolArray, brightest: FloatArray) -> CloudLook:
@@ -70,7 +78,8 @@ def cloud_look(xy: FloatArray, moves: BoolArray, brightest: FloatArray) -> Cloud
         return CloudLook()
     around = np.bincount(one, brightest[other], minlength=len(xy))[beside] / count[beside]
     brighter = brightest[beside] - around
-    return CloudLook(int(beside.sum()) / int(moves.sum()), log10_signed_rank_tail(brighter))
+    among = int(beside.sum()) / int(moves.sum())
+    return CloudLook(among, log10_signed_rank_tail(brighter), positive_rank_share(brighter))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

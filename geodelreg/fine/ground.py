@@ -53,23 +53,26 @@ def find_ground(
 ) -> Ground:
     """Tell the ground from what moves differently.
 
-    Where clouds explain what moves, the ground is what one affine explains: it kept still.
+    Where clouds explain what moves, the ground is what one affine explains: it kept still.  That is
+    the affine that most agree on, or, where clouds cover most, the correction to be judged.
     Elsewhere it is the largest layer, bent as it may be.
 
     Parameters
     ----------
     source, target : (N, 2) float64
-        Patches, and where they lie under the header, in pixels of the coarser image.
+        Patches, and where they lie less what the correction moves them, in pixels of the coarser
+        image.
     variance_px2 : (N,) float64
         Trace of the covariance of `target`.
     brightest : (N,) float64
         As for `geodelreg.fine.clouds.cloud_look`.
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
-    core = consensus_affine(source, target, variance_px2, tolerance)
-    look = cloud_look(source, ~core.inliers, brightest)
-    if look.explains:
-        return Ground(core.inliers, np.where(core.inliers, 0, -1).astype(np.intp), look)
+    core = consensus_affine(source, target, variance_px2, tolerance).inliers
+    for still in (core, np.hypot(*(target - source).T) <= tolerance):
+        look = cloud_look(source, ~still, brightest)
+        if look.explains:
+            return Ground(still, np.where(still, 0, -1).astype(np.intp), look)
     label = layers(source, target - source, np.sqrt(variance_px2))
     return Ground(label == 0, label, look)
 

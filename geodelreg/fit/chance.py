@@ -81,10 +81,22 @@ def log10_signed_rank_tail(differences: FloatArray) -> float:
     """
     from scipy.special import log_ndtr
 
-    rank = np.argsort(np.argsort(np.abs(differences), kind="stable"), kind="stable") + 1.0
+    rank = _ranks(differences)
     excess = float(rank[differences > 0].sum() - rank.sum() / 2)
     spread = math.sqrt(float((rank**2).sum())) / 2
     return float(log_ndtr(-excess / spread)) / _LN_10
+
+
+def positive_rank_share(differences: FloatArray) -> float:
+    """Share of the sum of ranks that positive ones of (N,) values hold; by chance about a half."""
+    rank = _ranks(differences)
+    return float(rank[differences > 0].sum() / rank.sum())
+
+
+def _ranks(differences: FloatArray) -> FloatArray:
+    """(N,) from 1, of the sizes of values."""
+    order = np.argsort(np.abs(differences), kind="stable")
+    return np.argsort(order, kind="stable").astype(np.float64) + 1.0
 
 
 def _log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from geodelreg.fine.clouds import cloud_look, height_parallax
-from geodelreg.fine.ground import other_motions
+from geodelreg.fine.ground import find_ground, other_motions
 from geodelreg.fine.motions import layers, second_motion
 from geodelreg.judge.words import region
 
@@ -122,6 +122,22 @@ def test_what_moves_and_is_no_brighter_is_none() -> None:
     moves = rng.random(len(xy)) < 0.3
     assert not cloud_look(xy, moves, brightest(moves, 0.0, rng)).explains
     assert not cloud_look(xy, moves, brightest(moves, -1.5, rng)).explains
+
+
+def test_many_patches_that_are_hardly_brighter_are_no_clouds() -> None:
+    """However unlikely by chance: a cloud is brighter than the ground beside it, not a little."""
+    rng, xy = np.random.default_rng(8), lattice(30)
+    moves = rng.random(len(xy)) < 0.3
+    assert not cloud_look(xy, moves, brightest(moves, 0.5, rng)).explains
+
+
+def test_the_ground_between_more_clouds_is_where_the_correction_puts_it() -> None:
+    rng, xy = np.random.default_rng(9), lattice(8)
+    moves = rng.random(len(xy)) < 0.65
+    shift = np.where(moves[:, None], (-1.7, 1.1), (0.0, 0.0)) + rng.normal(0, 0.01, xy.shape)
+    ground = find_ground(xy, xy + shift, np.full(len(xy), 1e-4), brightest(moves, 8.0, rng))
+    assert ground.look.explains
+    assert (ground.member == ~moves).mean() > 0.95
 
 
 def test_a_scene_that_is_brighter_at_the_end_that_moves_shows_no_clouds() -> None:
