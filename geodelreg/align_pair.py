@@ -249,12 +249,14 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         if bent or passes(judge(evidence, options)):
             whole = look_at_whole(guess, refined, fitted.map)
             everyone = hear_everyone(pair, found, whole)
-            if everyone is not None:
+            closer = whole if everyone is None else whole.under(pair, everyone.map)
+            follows = may_bend(options) and (bent or options.model == "field")
+            follows |= may_bend(options) and closer.is_bent(options)
+            if everyone is not None and not follows:
                 again = gather(guess, refined, everyone, heard)
                 if passes(judge(again[1], options)):
-                    fitted, (accuracy, evidence) = everyone, again
-                    whole = whole.under(pair, fitted.map)
-            if may_bend(options) and (bent or options.model == "field" or whole.is_bent(options)):
+                    fitted, (accuracy, evidence), whole = everyone, again, closer
+            if follows or (may_bend(options) and whole.is_bent(options)):
                 refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
                 accuracy, evidence = gather(guess, refined, fitted, heard)
                 whole = whole.followed(pair, fitted)

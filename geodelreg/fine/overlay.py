@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from affine import Affine
@@ -10,12 +11,14 @@ from affine import Affine
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.grid import outline
+from geodelreg.geo.maps.spline import Values, interpolated
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid
+from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Grid
 
 _WIDEST = 2
+_SPLINE_PX = 0.01  # of the finer raster, whose decimated pixels are wider than one
 _ROWS = 128  # at a time: positions of 1000 columns take 2 MB
 
 
@@ -60,11 +63,17 @@ def overlay(part: Roles, template: Band, surface: Surface, correction: PixelMap)
     usable = np.empty((height, width), dtype=np.bool_)
     for top in range(0, height, _ROWS):  # positions need ten times the memory of values
         some = slice(top, min(top + _ROWS, height))
-        sides = (np.arange(width), np.arange(some.start, some.stop))
-        x, y = to_full @ tuple(np.meshgrid(*(pixel_centres(side) for side in sides)))
-        xy = np.stack([x, y], axis=-1)
-        values[some], usable[some] = sample(surface, there.forward(xy))
+        place: Values = partial(_places, there, to_full @ Affine.translation(0, top))
+        if correction.as_affine() is None:
+            place, _ = interpolated(place, (some.stop - top, width), _SPLINE_PX)
+        sides = (pixel_centres(np.arange(side)) for side in (some.stop - top, width))
+        values[some], usable[some] = sample(surface, place(*sides))
     return Overlay(template.data, values, template.valid, usable)
+
+
+def _places(there: PixelMap, to_full: Affine, y: FloatArray, x: FloatArray) -> FloatArray:
+    """(R, C, 2) where a map puts the pixels at rows and columns of a decimated grid."""
+    return there.forward(apply_affine(to_full, np.stack(np.meshgrid(x, y), axis=-1)))
 
 
 def widened(part: Roles, template: Band, surface: Band, correction: PixelMap) -> Band:

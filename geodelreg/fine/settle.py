@@ -20,6 +20,7 @@ from geodelreg.fine.tuning import fit_sigma, fit_tone
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import FEWEST_POINTS, FieldFit, fit_field
 from geodelreg.fit.jumps import find_jumps
+from geodelreg.geo.maps.field import FieldMap
 from geodelreg.pair import overlap_in_template
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
@@ -122,6 +123,7 @@ def _everywhere(refined: Refinement, start: PixelMap) -> Refinement:
 def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
     part, tiles, tuning = refined.part, refined.tiles, refined.tuning
     current, settled = start, None
+    kernel = start.kernel if isinstance(start, FieldMap) else None
     jumps: tuple[float, ...] = ()
     options = MatchOptions(size, _ITERATIONS, _TOLERANCE, bent=True)
     for number in range(1, _MOST_PASSES + 1):
@@ -142,15 +144,15 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
         some = points.take(ground)
         if len(some) < FEWEST_POINTS or not np.ptp(some.source, axis=0).min() > 0:
             return settled
-        fit = fit_field(some, None if settled is None else settled.fit.field.kernel, jumps)
+        fit = fit_field(some, kernel, jumps)
         if settled is None:
             jumps = find_jumps(some.take(fit.inlier), fit.field.kernel, fit.weight)
             if jumps:
-                fit = fit_field(some, None, jumps)
+                fit = fit_field(some, kernel, jumps)
         there = replace(refined, tuning=tuning, size=size)
         settled = Settled(fit, matched, points, ground, there, number)
         moved = _rms(fit.field.forward(some.source) - current.forward(some.source))
-        current = fit.field
+        current, kernel = fit.field, fit.field.kernel
         if moved < _STANDS_STILL * _sigma(settled):
             break
         options = replace(options, iterations=_LATER_ITERATIONS)

@@ -159,13 +159,15 @@ def fit_sigma(
     per_tile = max(_SAMPLES // len(chosen), LEAST_SAMPLES)
     lattices = [lattice(tile.template[0], part, per_tile) for tile in chosen]
     covered = [_covered(part, tile.template[0], agreed, size) for tile in chosen]
+    places = [there.forward(xy)[:, None] for xy, _ in lattices]
 
     def unexplained(sigma: float) -> float:
         total = 0.0
-        for tile, (xy, take), inside in zip(chosen, lattices, covered, strict=True):
+        where = zip(chosen, lattices, covered, places, strict=True)
+        for tile, (_, take), inside, place in where:
             images = Tile(tile.template, tile.surface)
             (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
-            values, usable = sample(surface, there.forward(xy)[:, None])
+            values, usable = sample(surface, place)
             good = usable[:, 0] & template.valid[take] & inside[take]
             total += _unexplained(values[good, 0], template.data[take][good])
         return total

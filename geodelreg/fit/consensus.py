@@ -50,6 +50,7 @@ def consensus_affine(
     threshold_px: float,
     seed: int = 0,
     kind: str = "affine",
+    least_share: float = 0.0,
 ) -> Consensus:
     """Find the transformation that most matches agree on, by sampling.
 
@@ -71,6 +72,8 @@ def consensus_affine(
         Of the sampling; the same seed gives the same result.
     kind : str
         ``similarity`` or ``affine``.
+    least_share : float
+        Of the matches, that must agree to be of interest: fewer are not searched for.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def consensus_affine(
     rng = np.random.default_rng(seed)
     matrices: list[FloatArray] = []
     scores: list[FloatArray] = []
-    best_score = dict.fromkeys(SAMPLES[kind], 0.0)
+    best_score = dict.fromkeys(SAMPLES[kind], least_share * len(pool))
     for done in range(1, _MAX_ROUNDS + 1):
         for sample in SAMPLES[kind]:
             hypotheses = _sampled_hypotheses(source, reference, rng, sample)

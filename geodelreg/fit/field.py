@@ -27,8 +27,7 @@ _LEAST_VARIANCE_PX2 = 1e-8  # unexplained: ablate
 _IMPOSSIBLE = 1e12  # unexplained: ablate
 _LEAST_NUGGET_PX2 = 1e-7  # unexplained: ablate
 _STEPS = 20  # unexplained: ablate
-_CLOSE = 1e-6  # relative; unexplained: ablate
-_STEP = 1e-3  # of a logarithm; unexplained: ablate
+_CLOSE = 1e-5  # relative: a hundredth of the likelihood that one unit of a kernel is worth
 _DIGITS = 2  # of the logarithms of a kernel: a percent, far below what points tell of it
 
 
@@ -134,30 +133,34 @@ def tuned(
         range_px, one, other, nugget = (float(value) for value in np.exp(theta))
         return Kernel(range_px, (one, other), nugget)
 
-    def cost(theta: FloatArray) -> float:
+    def cost(theta: FloatArray) -> tuple[float, FloatArray]:
+        """And its derivatives; of an axis by each part of its covariance (Rasmussen, 5.9)."""
         trial = kernel_of(theta)
-        correlation = trial.correlation(apart)
+        correlation, growth = trial.correlation(apart), trial.growth(apart)
         if together is not None:
-            correlation *= together
+            correlation, growth = correlation * together, growth * together
         noise = (own + trial.nugget_px2) / weight[:, None]
+        total, slope = 0.0, np.zeros(4)
         try:
-            return sum(
-                solve_axis(
-                    columns, correlation, move[:, i], noise[:, i], trial.variance_px2[i]
-                ).cost()
-                for i in (0, 1)
-            )
+            for i, variance in enumerate(trial.variance_px2):
+                axis = solve_axis(columns, correlation, move[:, i], noise[:, i], variance)
+                steep = axis.precision() - np.outer(axis.alpha, axis.alpha)
+                total += axis.cost()
+                slope[0] += variance * np.vdot(steep, growth)
+                slope[1 + i] = variance * np.vdot(steep, correlation)
+                slope[3] += trial.nugget_px2 * (np.diag(steep) / weight).sum()
         except np.linalg.LinAlgError:
-            return _IMPOSSIBLE
+            return _IMPOSSIBLE, np.zeros(4)
+        return total, slope
 
     most = (MOST_STRAIN * extent) ** 2
     low = np.log([_spacing(points), *3 * [_LEAST_VARIANCE_PX2]])
     high = np.log([max(extent, 2 * _spacing(points)), most, most, most])
     start = np.log([kernel.range_px, *kernel.variance_px2, kernel.nugget_px2])
     found = minimize(
-        cost,
-        np.clip(start, low, high), method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": _STEPS, "ftol": _CLOSE, "eps": _STEP},
+        cost, np.clip(start, low, high), jac=True,
+        method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": _STEPS, "ftol": _CLOSE},
     )  # fmt: skip
     return field_of(points, kernel_of(np.round(found.x, _DIGITS)), weight, jumps)
 

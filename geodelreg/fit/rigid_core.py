@@ -16,6 +16,7 @@ _CORE_FLOOR_PX = 0.03  # of a patch pixel; unexplained: ablate
 _GROWTH = 1.5  # of the tolerance from try to try; unexplained: ablate
 _SHIFT_SHARE = 0.15  # unexplained: ablate
 _AFFINE_SHARE = 0.25  # unexplained: ablate
+_SOUGHT_SHARE = _AFFINE_SHARE / 2  # so long that of several such shares the best is found
 _CORE_REACH = 2.0
 
 
@@ -57,6 +58,8 @@ def _rigid_residuals(
     move = points.target - points.source
     near = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1)) <= tolerance
     yield move - move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
-    found = consensus_affine(points.source, points.target, variance, tolerance, kind="affine")
+    found = consensus_affine(
+        points.source, points.target, variance, tolerance, least_share=_SOUGHT_SHARE
+    )
     if found.map is not None:
         yield points.target - found.map.forward(points.source)

@@ -125,8 +125,10 @@ def _explained(
     inside = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
     take = (picked[:, None] * size + picked[None, :]).ravel()
     spots = (offsets[:, None, :] + inside[None]).reshape(-1, 2) * patches.step
-    xy = patches.centre[chosen][:, None, :] + spots[None]
-    there, usable = sample(surface, to_surface.forward(xy))
+    # a patch is so small that its local affine puts its pixels where a map that bends does
+    local = to_surface.linearise(patches.centre[chosen])
+    place = local[:, None, :, 2] + np.einsum("pij,sj->psi", local[:, :, :2], spots)
+    there, usable = sample(surface, place)
     shape = (len(chosen), len(offsets), len(take))
     seen = usable.reshape(shape) & patches.valid[chosen][:, None, take]
     weight = seen.astype(np.float64)[:, :, None]

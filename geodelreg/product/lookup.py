@@ -9,7 +9,7 @@ from a spline through a coarser lattice, on which the map itself is asked.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from affine import Affine
 from geodelreg.door.opening import open_raster, own_name
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
+from geodelreg.geo.maps.spline import FINEST_PX, MARGIN, axes, interpolated
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Correction
@@ -29,13 +30,8 @@ from geodelreg.values.result import Correction
 TOLERANCE_PX = 1e-3
 """Of a source pixel, between the map and what is interpolated."""
 _SPLINE_PX = TOLERANCE_PX / 4
-_COARSEST_PX, _FINEST_PX = 64, 2
-_MARGIN = 2  # nodes around the target, where a spline has no end to be unsure of
 _UNDEFINED = -1e9
 """Far outside of any source."""
-
-_Values = Callable[[FloatArray, FloatArray], FloatArray]
-"""(R, C, 2) source pixels at (R,) rows and (C,) columns of the target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +43,7 @@ class Lookup:
     nodes : (R, C, 2) float64
         Source pixels, outer corner.
     step : int
-        Target pixels between nodes; the first lies `_MARGIN` of these up and left of the corner.
+        Target pixels between nodes; the first lies `MARGIN` of these up and left of the corner.
     rows : (int, int)
         Of the source, first and past the last, that are seen.
     """
@@ -95,57 +91,17 @@ def make_lookup(there: PixelMap, shape: tuple[int, int], rows: tuple[int, int]) 
     rows : (int, int)
         Of the source.
     """
-    values, step = _interpolated(lambda y, x: _asked(there, y, x), shape)
-    nodes = values(*_axes(shape, step))
-    while step > _FINEST_PX:
-        y, x = _axes(shape, step)
+    values, step = interpolated(lambda y, x: _asked(there, y, x), shape, _SPLINE_PX)
+    nodes = values(*axes(shape, step))
+    while step > FINEST_PX:
+        y, x = axes(shape, step)
         middle = (nodes[1:, 1:] + nodes[:-1, 1:] + nodes[1:, :-1] + nodes[:-1, :-1]) / 4
         gap = np.abs(values(y[:-1] + step / 2, x[:-1] + step / 2) - middle)
         if not np.nanmax(gap, initial=0.0) > TOLERANCE_PX:
             break
         step //= 2
-        nodes = values(*_axes(shape, step))
+        nodes = values(*axes(shape, step))
     return Lookup(np.where(np.isfinite(nodes), nodes, _UNDEFINED), step, rows)
-
-
-def _interpolated(asked: _Values, shape: tuple[int, int]) -> tuple[_Values, int]:
-    """A spline through as many places as it takes, and their distance.
-
-    The map itself where it is not defined everywhere.
-    """
-    step = _COARSEST_PX
-    known = asked(*_axes(shape, step))
-    while np.isfinite(known).all() and step > _FINEST_PX:
-        spline = _spline(known, shape, step)
-        finer = asked(*_axes(shape, step // 2))
-        gap = np.abs(spline(*_axes(shape, step // 2)) - finer)
-        step, known = step // 2, finer
-        if np.nanmax(gap) <= _SPLINE_PX:
-            return _spline(known, shape, step), step
-    return asked, _COARSEST_PX
-
-
-def _axes(shape: tuple[int, int], step: int) -> tuple[FloatArray, FloatArray]:
-    """Rows and columns of nodes over a target, with the margin."""
-    rows, columns = (
-        step * np.arange(-_MARGIN, -(-size // step) + _MARGIN + 1, dtype=np.float64)
-        for size in shape
-    )
-    return rows, columns
-
-
-def _spline(known: FloatArray, shape: tuple[int, int], step: int) -> _Values:
-    from scipy.interpolate import RectBivariateSpline
-
-    rows, columns = _axes(shape, step)
-    across, down = (RectBivariateSpline(rows, columns, known[:, :, axis]) for axis in (0, 1))
-    low, high = (rows[0], columns[0]), (rows[-1], columns[-1])
-
-    def values(y: FloatArray, x: FloatArray) -> FloatArray:
-        y, x = np.clip(y, low[0], high[0]), np.clip(x, low[1], high[1])
-        return np.stack([across(y, x), down(y, x)], axis=-1)
-
-    return values
 
 
 def _asked(there: PixelMap, y: FloatArray, x: FloatArray) -> FloatArray:
@@ -208,7 +164,7 @@ def _look_up(
     _add(transformer, "SrcInvGeoTransform", "0,1,0,0,0,1")
     places = _add(_add(transformer, "DstGeoLocTransformer"), "GeoLocTransformer")
     _add(places, "Reversed", "0")
-    offset, step = str(-_MARGIN * lookup.step), str(lookup.step)
+    offset, step = str(-MARGIN * lookup.step), str(lookup.step)
     convention = {
         "X_DATASET": array,
         "X_BAND": "1",

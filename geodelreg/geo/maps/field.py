@@ -53,6 +53,11 @@ class Kernel:
         scaled = self.decay * distance_px
         return np.asarray((1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled))
 
+    def growth(self, distance_px: FloatArray) -> FloatArray:
+        """Derivative of the correlation by the logarithm of the range."""
+        scaled = self.decay * distance_px
+        return np.asarray(scaled**2 / 3.0 * (1.0 + scaled) * np.exp(-scaled))
+
     def fall(self, distance_px: FloatArray) -> FloatArray:
         """Derivative of the correlation by the place, over the vector between both places."""
         scaled = self.decay * distance_px
@@ -320,6 +325,15 @@ class Axis:
         logs = np.log(np.diag(self.factor)).sum() + np.log(np.diag(self.normal)).sum()
         return float(2.0 * logs + self.white @ self.white)
 
+    def precision(self) -> FloatArray:
+        """(N, N) of the points, with what the trend takes of it; `alpha` is it times the moves."""
+        from scipy.linalg.lapack import dpotri
+
+        half, _ = dpotri(self.factor, lower=1)
+        inverse = np.tril(half) + np.tril(half, -1).T
+        trend = _lower(self.normal, _upper(self.factor, self.design).T)
+        return np.asarray(inverse - trend.T @ trend)
+
     def predict(self, near: FloatArray, columns: FloatArray) -> FloatArray:
         """(M,) displacement."""
         return np.asarray(columns @ self.beta + self.variance * (near.T @ self.alpha))
@@ -361,7 +375,7 @@ def solve_axis(
     numpy.linalg.LinAlgError
         The points determine no trend.
     """
-    from scipy.linalg import cho_solve, cholesky, solve_triangular
+    from scipy.linalg import cho_solve, cholesky
 
     total = variance_px2 * correlation
     total[np.diag_indices_from(total)] += noise_px2 + _JITTER * variance_px2
@@ -371,14 +385,19 @@ def solve_axis(
     normal = cholesky(design.T @ design, lower=True)
     beta = cho_solve((normal, True), design.T @ white)
     white = white - design @ beta
-    alpha = solve_triangular(factor, white, lower=True, trans=1, check_finite=False)
-    return Axis(variance_px2, factor, design, normal, beta, white, alpha)
+    return Axis(variance_px2, factor, design, normal, beta, white, _upper(factor, white))
 
 
 def _lower(factor: FloatArray, right: FloatArray) -> FloatArray:
     from scipy.linalg import solve_triangular
 
     return np.asarray(solve_triangular(factor, right, lower=True, check_finite=False))
+
+
+def _upper(factor: FloatArray, right: FloatArray) -> FloatArray:
+    from scipy.linalg import solve_triangular
+
+    return np.asarray(solve_triangular(factor, right, lower=True, trans=1, check_finite=False))
 
 
 def distances(one: FloatArray, other: FloatArray) -> FloatArray:
