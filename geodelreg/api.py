@@ -210,7 +210,7 @@ def check(
         When an argument is of the wrong type.
     """
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
-        raise UsageError(f"limit_px = {limit_px} is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
+        raise UsageError(f"`limit_px={limit_px}` is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
     options = replace(options, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn")
     with _open(source, reference, options, masks, pan_masks) as rasters:

@@ -97,7 +97,8 @@ def _apply_to_raster(
     if placement is not None and not options.warp:
         check_header_holds(stored.model)
         raise UsageError(
-            f"{file} is in another CRS, in which the correction is no affine", "Resample (--warp)."
+            f"{file} is in another CRS, in which the correction is no affine",
+            "Resample (`warp=True`).",
         )
     if target is None:
         with together([file]):

@@ -21,20 +21,6 @@ WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
 SEARCHES = ("auto", "keypoints")
 EXTENTS = ("pan", "intersection")
-UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
-FLAGS = {
-    "band": ("-b", "--band"),
-    "masks": ("--mask",),
-    "pan_masks": ("--pan-mask",),
-    "ms_nodata": ("--nodata",),
-    "threads": ("-j", "--num-threads"),
-    "workers": ("-j", "--workers"),
-    "driver": ("--of",),
-    "creation_options": ("--co",),
-    "warp_grid": ("--grid",),
-    "resampling": ("-r", "--resampling"),
-}
-"""Flags that GDAL's users know by another name than the knob's."""
 FIGURES = ("before-after", "arrows", "mesh", "error", "matches")
 RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
 
@@ -48,24 +34,18 @@ def knob_help(options: type, name: str) -> str:
     return str({f.name: f for f in fields(options)}[name].metadata["help"])
 
 
-def flags(knob: str) -> tuple[str, ...]:
-    """Flags of a knob: ``("--search-radius",)`` for ``search_radius_px``."""
-    bare = next((knob.removesuffix(unit) for unit in UNITS if knob.endswith(unit)), knob)
-    return FLAGS.get(knob, ("--" + bare.replace("_", "-"),))
-
-
 def _check_choice(options: object, name: str) -> None:
     spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
     choices, value = spec.metadata["choices"], getattr(options, name)
     if value not in choices:
-        raise UsageError(f"{name} = {value!r} is unknown", f"Use one of: {', '.join(choices)}.")
+        raise UsageError(f"`{name}={value!r}` is unknown", f"Use one of: {', '.join(choices)}.")
 
 
 def _check_masks(options: object, name: str) -> None:
     """Check the names of masks, and make paths of any kind strings."""
     value = getattr(options, name)
     if isinstance(value, str | os.PathLike):
-        raise UsageError(f"{name} = {value!r} is one name", "Give a tuple of them.")
+        raise UsageError(f"`{name}={value!r}` is one name", "Give a tuple of them.")
     masks = tuple(os.fspath(mask) for mask in value)
     for mask in masks:
         parse_mask(mask)
@@ -75,9 +55,9 @@ def _check_masks(options: object, name: str) -> None:
 def _check_range(options: object, name: str, low: float, high: float) -> None:
     value = getattr(options, name)
     if value is not None and not isinstance(value, int | float):
-        raise TypeError(f"{name} = {value!r} is no number")
+        raise TypeError(f"`{name}={value!r}` is no number")
     if value is not None and not low <= value <= high:
-        raise UsageError(f"{name} = {value} is out of range", f"Use {low:g} to {high:g}.")
+        raise UsageError(f"`{name}={value}` is out of range", f"Use {low:g} to {high:g}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +74,7 @@ class AlignOptions:
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
         "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
-        "projective one or a field, which follows what bends: --warp does.",
+        "projective one or a field, which follows what bends: `warp` does.",
         MODELS,
     )
     north_up: bool = _knob(
@@ -165,9 +145,9 @@ class AlignOptions:
     )
     on_local: str = _knob(
         "refuse",
-        "What to do where one affine leaves more than --max-residual: refuse; warn, and write the "
-        "best affine of the whole overlap all the same; or follow the bend with a field, as auto "
-        "does where --warp can carry it.",
+        "What to do where one affine leaves more than `max_residual_px`: refuse; warn, and write "
+        "the best affine of the whole overlap all the same; or follow the bend with a field, as "
+        "auto does where `warp` can carry it.",
         ("refuse", "warn", "field"),
     )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
@@ -201,13 +181,14 @@ class AlignOptions:
         _check_choice(self, "on_local")
         if self.north_up and self.model not in ("auto", "shift", "scale"):
             raise UsageError(
-                f"north_up and model = {self.model} exclude each other",
+                f"`north_up=True` and `model={self.model!r}` exclude each other",
                 "Use auto, shift or scale.",
             )
         _check_range(self, "threads", 0, 1024)
         if self.model == "field" and self.method != "delaunay":
             raise UsageError(
-                f"method = {self.method} knows no field", "Use --method delaunay or another model."
+                f"`method={self.method!r}` knows no field",
+                "Use `method='delaunay'`, or another model.",
             )
 
 
@@ -220,9 +201,9 @@ def check_header_holds(model: str) -> None:
     """
     if model in BEYOND_A_HEADER:
         raise UsageError(
-            f"model = {model} is no affine: no geotransform, and so no header, can hold it",
-            "Resample (--warp), pass it on as control points (--gcps FILE with --dry-run, or "
-            "--georef gcps), or use another model.",
+            f"`model={model!r}` is no affine: no geotransform, and so no header, can hold it",
+            "Resample (`warp=True`), pass it on as control points (`export_gcps` alone, or "
+            "`georef='gcps'`), or use another model.",
         )
 
 
@@ -252,11 +233,11 @@ class WriteOptions:
         "rotated geotransforms.",
     )
     warp_grid: str = _knob(
-        "ms", "Grid of --warp: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
+        "ms", "Grid of `warp`: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
     )
     resampling: str = _knob(
         "cubic",
-        "Resampling of --warp; quality bands (as QA_PIXEL, SCL) and colour tables keep to nearest.",
+        "Resampling of `warp`; quality bands (as QA_PIXEL, SCL) and colour tables keep to nearest.",
         RESAMPLINGS,
     )
 
@@ -268,7 +249,9 @@ class WriteOptions:
             if "=" not in option:
                 raise UsageError(f"creation option {option!r} is not KEY=VALUE")
         if self.warp and self.georef == "gcps":
-            raise UsageError("--warp and --georef gcps exclude each other", "Drop one of them.")
+            raise UsageError(
+                "`warp=True` and `georef='gcps'` exclude each other", "Drop one of them."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +261,7 @@ class BatchOptions:
     check: bool = _knob(False, "Verdicts only, as geodelreg check gives them; nothing is written.")
     limit_px: float = _knob(
         0.5,
-        "Largest misalignment, anywhere in the overlap, that --check counts as aligned, in PAN "
+        "Largest misalignment, anywhere in the overlap, that `check` counts as aligned, in PAN "
         "pixels.",
     )
     in_place: bool = _knob(
@@ -287,7 +270,7 @@ class BatchOptions:
     workers: int = _knob(
         0,
         "Pairs at a time on this machine, each in a process of one thread; 0 = as many as cores. "
-        "With --dask: pairs under way, 0 = four for each thread of the cluster.",
+        "On Dask: pairs under way, 0 = four for each thread of the cluster.",
     )
     timeout_s: float | None = _knob(
         None, "Seconds that a pair may take; one that takes longer has failed."
@@ -298,7 +281,7 @@ class BatchOptions:
         "Linux where the pairs run.",
     )
     fail_fast: bool = _knob(
-        False, "Start no pair after one has failed; --resume goes on with the rest."
+        False, "Start no pair after one has failed; `resume` goes on with the rest."
     )
 
     def __post_init__(self) -> None:
@@ -307,7 +290,9 @@ class BatchOptions:
         _check_range(self, "timeout_s", 1e-3, 1e9)
         _check_range(self, "memory_mb", 1, 1e9)
         if self.check and self.in_place:
-            raise UsageError("--check and --in-place exclude each other", "Drop one of them.")
+            raise UsageError(
+                "`check=True` and `in_place=True` exclude each other", "Drop one of them."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,7 +352,7 @@ class PansharpenOptions:
             values = ()
         if not values or not all(0 <= value < float("inf") for value in values) or not sum(values):
             raise UsageError(
-                f"weights = {self.weights!r} are no weights",
+                f"`weights={self.weights!r}` are no weights",
                 "Use auto, equal, or numbers of at least 0 such as 0.3,0.5,0.2.",
             )
         return values
@@ -383,5 +368,5 @@ class PansharpenOptions:
             return ()
         numbers = self.bands.split(",")
         if not all(text.strip().isdigit() and int(text) > 0 for text in numbers):
-            raise UsageError(f"bands = {self.bands!r} are no bands", "Use numbers such as 1,2,3.")
+            raise UsageError(f"`bands={self.bands!r}` are no bands", "Use numbers such as 1,2,3.")
         return tuple(int(text) for text in numbers)

@@ -99,7 +99,7 @@ def _weights(what: Sharpening, options: PansharpenOptions) -> list[float]:
         given = options.given_weights()
         if len(given) != count:
             raise UsageError(
-                f"weights = {options.weights!r} are {len(given)}, and {count} bands are sharpened",
+                f"`weights={options.weights!r}` are {len(given)}, and {count} bands are sharpened",
                 "Give one weight to each band, or use auto.",
             )
         return list(given)

@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 from geodelreg.errors import AlignmentRefusedError, UsageError, shown
+from geodelreg.flags import as_typed
 from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
 from geodelreg_cli.console import log_steps, progress_bar
@@ -252,7 +253,7 @@ def _check_outputs(request: Request) -> list[Path]:
 
             check_drawable(request.figure)
     except UsageError as error:
-        raise click.UsageError(str(error)) from error
+        raise click.UsageError(as_typed(str(error))) from error
     if not written:
         return []
     from geodelreg.writing import input_paths
@@ -307,7 +308,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
     _log_timings(alignment)
     if not request.quiet:
         click.echo(shown(_named(request)), err=True)
-        click.echo(summary_text(alignment, request.write_options), err=True)
+        click.echo(as_typed(summary_text(alignment, request.write_options)), err=True)
         click.echo(_step_counts(alignment), err=True)
         click.echo(shown(_written(request)), err=True)
 

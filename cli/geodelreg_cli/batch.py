@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geodelreg.errors import ManifestError, shown
+from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
 from geodelreg_cli.options import (
     SectionCommand,
@@ -270,7 +271,7 @@ def _line(result: PairResult) -> str:
     parts = [f"{result.number} {Path(result.sources[0]).name}: {result.outcome}"]
     parts += [result.error] if result.error else []
     parts += [result.reason] if result.reason else []
-    return shown(", ".join(parts))
+    return shown(as_typed(", ".join(parts)))
 
 
 def _summarise(ready: Batch) -> None:

@@ -10,6 +10,7 @@ from time import monotonic
 from typing import TYPE_CHECKING
 
 from geodelreg.errors import shown
+from geodelreg.flags import as_typed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -43,7 +44,7 @@ class _View:
         """Take one result in."""
         self._done += 1
         name, texts = Path(result.sources[0]).name, (*result.warnings, result.reason)
-        self._last.extend(shown(f"{name}: {text}") for text in texts if text)
+        self._last.extend(shown(f"{name}: {as_typed(text)}") for text in texts if text)
 
     def render(self) -> RenderableType:
         """The table as it is now."""

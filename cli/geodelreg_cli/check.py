@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geodelreg.errors import AlignmentRefusedError
+from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
@@ -117,7 +118,7 @@ def _show(found: Check, given: dict[str, Any]) -> None:
     if given["json"]:
         click.echo(check_json(found))
     elif not given["quiet"]:
-        click.echo(check_text(found))
+        click.echo(as_typed(check_text(found)))
 
 
 def _exit_code(found: Check) -> int:

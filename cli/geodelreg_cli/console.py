@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from geodelreg.errors import shown
+from geodelreg.flags import as_typed
 
 Progress = Callable[[float, str], None]
 
@@ -28,11 +29,11 @@ class _Stderr(logging.Handler):
 
 
 class _Shown(logging.Formatter):
-    """Names and texts of files in the messages cannot control the terminal."""
+    """Names and texts of files in the messages cannot control the terminal; knobs are flags."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
         """One line of one record."""
-        return shown(super().formatMessage(record).strip())
+        return shown(as_typed(super().formatMessage(record).strip()))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
         """Traceback."""

@@ -19,6 +19,7 @@ from io import StringIO
 import click
 
 from geodelreg.errors import AlignmentRefusedError, GeodelregError, shown
+from geodelreg.flags import as_typed
 from geodelreg.version import __version__
 from geodelreg_cli.interrupts import Terminated, termination_as_exception
 
@@ -128,9 +129,10 @@ def run(args: Sequence[str]) -> int:
 def _explain(error: Exception) -> int:
     """Say on stderr what went wrong and what helps, and return the exit code."""
     if isinstance(error, GeodelregError):
-        _say(f"{'refused' if isinstance(error, AlignmentRefusedError) else 'error'}: {error.cause}")
+        kind = "refused" if isinstance(error, AlignmentRefusedError) else "error"
+        _say(f"{kind}: {as_typed(error.cause)}")
         if error.remedy:
-            click.echo(f"  {error.remedy}", err=True)
+            click.echo(f"  {as_typed(error.remedy)}", err=True)
         return error.exit_code
     if isinstance(error, MemoryError):
         _say("error: out of memory")

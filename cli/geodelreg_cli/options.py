@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 import click
 
 from geodelreg.errors import UsageError
-from geodelreg.options import UNITS, AlignOptions, flags
+from geodelreg.flags import UNITS, as_typed, flags
+from geodelreg.options import AlignOptions, knob_help
 from geodelreg_cli.console import configure_logging
 
 _Options = TypeVar("_Options")
@@ -104,7 +105,10 @@ def knob_option(options: type, knob: str, section: str) -> SectionOption:
     """
     field = {f.name: f for f in fields(options)}[knob]
     return SectionOption(
-        [knob, *flags(knob)], section=section, help=field.metadata["help"], **_kind(field)
+        [knob, *flags(knob)],
+        section=section,
+        help=as_typed(knob_help(options, knob)),
+        **_kind(field),
     )
 
 
@@ -221,14 +225,9 @@ def build(options: type[_Options], given: Mapping[str, Any]) -> _Options:
     Raises
     ------
     click.UsageError
-        With the flag the user typed in place of the knob's name.
     """
     names = [f.name for f in fields(options) if f.name in given]  # type: ignore[arg-type]
     try:
         return options(**{name: given[name] for name in names})
     except UsageError as error:
-        cause = str(error)
-        knob = next((name for name in names if cause.startswith(f"{name} ")), None)
-        if knob is not None:
-            cause = flags(knob)[-1] + cause.removeprefix(knob)
-        raise click.UsageError(cause) from error
+        raise click.UsageError(as_typed(str(error))) from error

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions, PansharpenOptions
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
@@ -113,4 +114,4 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     if alignment is not None and not given["quiet"]:
         from geodelreg.product.report import summary_text
 
-        click.echo(summary_text(alignment), err=True)
+        click.echo(as_typed(summary_text(alignment)), err=True)

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from geodelreg.errors import GeodelregError
+from geodelreg.flags import as_typed
 from geodelreg_cli.align import EPILOG
 from geodelreg_cli.align import align as align_command
 from geodelreg_cli.options import SectionCommand
@@ -25,7 +26,7 @@ class _RioCommand(SectionCommand):
             try:
                 return super().invoke(ctx)
             except GeodelregError as error:
-                click.echo(f"Error: {error}", err=True)
+                click.echo(f"Error: {as_typed(str(error))}", err=True)
                 ctx.exit(error.exit_code)
 
 

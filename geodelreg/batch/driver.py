@@ -287,7 +287,7 @@ class Batch:
             what = "the executor is broken" if isinstance(error, BrokenExecutor) else "no pair runs"
             raise ClusterError(
                 f"{what} ({type(error).__name__}: {error})",
-                "Repair the workers, then go on with --resume: what is finished is not repeated.",
+                "Repair the workers, then add `resume=True`: what is finished is not repeated.",
             ) from error
         losses[number] += 1
         if losses[number] < _LOST_WORKERS:
@@ -350,7 +350,7 @@ def _known_outcomes(names: Iterable[str]) -> tuple[str, ...]:
     names = tuple(names)
     for name in names:
         if name not in OUTCOMES:
-            raise UsageError(f"retry = {name!r} is unknown", f"Use one of: {', '.join(OUTCOMES)}.")
+            raise UsageError(f"`retry={name!r}` is unknown", f"Use one of: {', '.join(OUTCOMES)}.")
     return names
 
 

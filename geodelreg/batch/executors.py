@@ -16,7 +16,7 @@ from geodelreg.errors import ClusterError, MissingExtraError
 logger = logging.getLogger(__name__)
 
 _PER_THREAD = 4
-_RESUME = "Once it runs, go on with --resume: what is finished is not repeated."
+_RESUME = "Once it runs, go on with `resume=True`: what is finished is not repeated."
 
 
 class Workers(Protocol):

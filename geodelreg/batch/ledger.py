@@ -76,14 +76,14 @@ class Ledger:
             (version,) = self._db.execute("PRAGMA user_version").fetchone()
         except sqlite3.DatabaseError as error:
             raise LedgerError(
-                f"{self.path} is no ledger ({error})", "Name another file with --ledger."
+                f"{self.path} is no ledger ({error})", "Name another file (`ledger`)."
             ) from error
         if application != _APPLICATION:
-            raise LedgerError(f"{self.path} is no ledger", "Name another file with --ledger.")
+            raise LedgerError(f"{self.path} is no ledger", "Name another file (`ledger`).")
         if version != VERSION:
             raise LedgerError(
                 f"{self.path} is a ledger of version {version}, this geodelreg writes {VERSION}",
-                "Go on with the geodelreg that began it, or begin another with --ledger.",
+                "Go on with the geodelreg that began it, or begin another (`ledger`).",
             )
 
     @staticmethod
@@ -97,7 +97,7 @@ class Ledger:
         if path.exists():
             raise LedgerError(
                 f"{path} exists",
-                "Go on with --resume or --retry, or begin another ledger with --ledger.",
+                "Go on with `resume=True` or `retry`, or begin another (`ledger`).",
             )
 
     @staticmethod
@@ -150,7 +150,7 @@ class Ledger:
             raise LedgerError(
                 f"{self.path} belongs to other pairs, or to the same with other options",
                 "Give the manifest and the options that it was begun with, or begin another "
-                "ledger with --ledger.",
+                "(`ledger`).",
             )
 
     def counts(self) -> Counter[str]:

@@ -137,7 +137,7 @@ class _Targets:
         path = resolved(target)
         in_place = self._setting.mode == IN_PLACE
         if not in_place and not path.startswith(self._root.rstrip(os.sep) + os.sep):
-            raise UsageError(f"out {target} lies outside of {self._root}", "Use --out-root.")
+            raise UsageError(f"out {target} lies outside of {self._root}", "Use `out_root`.")
         if path in self._places:
             what = "is corrected in place by" if in_place else "is the output of"
             raise UsageError(f"{target} {what} {self._places[path]} already")
@@ -147,7 +147,7 @@ class _Targets:
         if Path(path).is_dir():
             raise UsageError(f"out {target} is a folder")
         if self._setting.fresh and not self._setting.write.overwrite and os.path.lexists(path):
-            raise UsageError(f"out {target} exists; --overwrite replaces it")
+            raise UsageError(f"out {target} exists; `overwrite=True` replaces it")
 
     def check(self, inputs: set[str]) -> None:
         """What can be told only when all are known."""
@@ -234,7 +234,7 @@ def _output(out: Any, setting: Setting) -> str:
     if setting.mode == CHECK or out in (None, ""):
         return ""
     if setting.mode == IN_PLACE:
-        raise UsageError("out has a value, and MS itself is corrected (--in-place)")
+        raise UsageError("out has a value, and MS itself is corrected (`in_place=True`)")
     if not isinstance(out, str):
         raise UsageError("out is no text")
     if not is_local(out):

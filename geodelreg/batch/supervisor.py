@@ -154,13 +154,13 @@ class Child:
                 self.end()
                 raise PairTimeoutError(
                     f"{name} took more than {timeout_s:g} s",
-                    "Allow more with --timeout, then --retry failed.",
+                    "Allow more (`timeout_s`), then `retry=['failed']`.",
                 )
             if memory_mb is not None and _peak_mb(self._process.pid) > memory_mb:
                 self.end()
                 raise PairMemoryError(
                     f"{name} needed more than {memory_mb} MB of memory",
-                    "Allow more with --memory, then --retry failed.",
+                    "Allow more (`memory_mb`), then `retry=['failed']`.",
                 )
 
     def _not_started(self) -> GeodelregError:
@@ -234,8 +234,8 @@ class Children:
             )
         if task.memory_mb is not None and not _STATUS.exists():
             raise ClusterError(
-                f"{platform.node()} does not say what its processes hold, and --memory needs that",
-                "Leave --memory out, or run on Linux.",
+                f"{platform.node()} does not say what its processes hold; `memory_mb` needs that",
+                "Leave `memory_mb` out, or run on Linux.",
             )
         start = monotonic()
         attempt = 1
@@ -264,7 +264,9 @@ class Children:
         except GeodelregError as error:
             self._drop(child)
             if self._stopped:
-                raise _FinalError(ClusterError("the batch was stopped", "Add --resume.")) from None
+                raise _FinalError(
+                    ClusterError("the batch was stopped", "Add `resume=True`.")
+                ) from None
             spent = isinstance(error, PairMemoryError) and child.pairs == 1
             if spent or isinstance(error, PairTimeoutError):
                 raise _FinalError(error) from None

@@ -12,6 +12,7 @@ from typing import Any
 
 from geodelreg.batch.job import FIGURES, PairResult
 from geodelreg.errors import MissingExtraError, UsageError
+from geodelreg.flags import as_typed
 from geodelreg.geotiff.atomic import staged
 
 _BEFORE = ("number", "sources", "reference", "output", "outcome", "error", "reason", "warnings")
@@ -86,7 +87,7 @@ def _index(results: Iterable[PairResult], folder: Path) -> str:
             Path(first).name + (f" and {len(more)} more" if more else ""),
             Path(result.reference).name,
             result.outcome,
-            " ".join(text for text in (result.error, result.reason) if text),
+            as_typed(" ".join(text for text in (result.error, result.reason) if text)),
             result.figures,
             result.footprint,
             name if (folder / name).is_file() else "",

@@ -120,7 +120,7 @@ class Inspection:
         if kind is None and is_markup(head):
             raise RasterUnreadableError(
                 f"{file} is not a raster that GDAL can open: it is a text, XML or the like",
-                "Give a GeoTIFF or another raster format that gdalinfo reads; --allow all opens "
+                "Give a GeoTIFF or another raster format that gdalinfo reads; `allow='all'` opens "
                 "those that are XML.",
             )
         needed = LOCAL if kind is None else needed_for(kind)

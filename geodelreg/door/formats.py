@@ -98,7 +98,7 @@ def _rows() -> Iterator[tuple[str, Format]]:
 
 
 FORMATS = dict(_rows())
-"""By GDAL's short name.  A format that is not here needs ``--allow all``."""
+"""By GDAL's short name.  A format that is not here needs `allow` to be ``all``."""
 
 _REACHES = {LOCAL: ("alone", "checked"), NETWORK: ("alone", "checked", "network")}
 
@@ -195,7 +195,7 @@ def is_markup(head: bytes) -> bool:
 
 
 def needed_for(driver: str) -> str:
-    """Least value of ``--allow`` under which files of a format are opened."""
+    """Least value of `allow` under which files of a format are opened."""
     reach = FORMATS[driver].reach if driver in FORMATS else "all"
     return {"network": NETWORK, "all": ALL}.get(reach, LOCAL)
 

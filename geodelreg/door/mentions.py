@@ -87,7 +87,7 @@ def _parsed(file: AnyFile | str, text: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError) as error:
         raise RasterUnreadableError(
             f"{file} is no XML that can be checked ({error})",
-            "Build it again; --allow all leaves it to GDAL.",
+            "Build it again; `allow='all'` leaves it to GDAL.",
         ) from error
 
 

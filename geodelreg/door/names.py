@@ -42,9 +42,9 @@ _ZIP = re.compile(r"(?:/vsizip/|zip://)(.*)", re.DOTALL)
 
 
 def refuse(what: str, allow: str) -> AccessNotAllowedError:
-    """Error for something that needs ``--allow``."""
+    """Error for something that needs another `allow`."""
     return AccessNotAllowedError(
-        what, f"If you trust where the name or the file comes from, add --allow {allow}."
+        what, f"If you trust where the name or the file comes from, add `allow={allow!r}`."
     )
 
 
@@ -122,7 +122,7 @@ def check_name(name: str, allow: str, where: str = "") -> None:
 
 
 def needed_access(name: str) -> str:
-    """Least value of ``--allow`` under which GDAL may be given a name."""
+    """Least value of `allow` under which GDAL may be given a name."""
     if not is_special(name):
         return LOCAL
     handlers = set(re.findall(r"/(vsi\w+)", name))

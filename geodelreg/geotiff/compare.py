@@ -63,7 +63,7 @@ def check_placement(
     if not good:
         raise OutputUnwritableError(
             f"{target} cannot be written: {driver} does not keep this georeferencing",
-            "Choose another format, e.g. --of GTiff.",
+            "Choose another format, e.g. `driver='GTiff'`.",
         )
 
 
@@ -209,7 +209,8 @@ def _read(dataset: Any, window: Any, what: str, error_class: type, path: Path) -
 def _lossy(target: Path, what: str) -> LossyOutputError:
     return LossyOutputError(
         f"{target} would not keep the pixels: {what}",
-        "Choose a lossless compression or format, e.g. --of GTiff --co COMPRESS=DEFLATE.",
+        "Choose a lossless compression or format, e.g. `driver='GTiff'` and "
+        "`creation_options=['COMPRESS=DEFLATE']`.",
     )
 
 

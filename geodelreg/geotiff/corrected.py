@@ -126,6 +126,6 @@ def _losses(source: Path, out: Path, content: Provenance, copied: bool) -> list[
     if has_rpc:
         notes.append(
             f"{source.name}: the output keeps RPCs, which do not know the correction; "
-            "--strip-rpc drops them"
+            "`strip_rpc=True` drops them"
         )
     return notes

@@ -38,7 +38,7 @@ from geodelreg.values.result import Correction
 logger = logging.getLogger(__name__)
 
 _EXACT_PX = 1e-6
-_TO_OUT = "Write the result to another file (OUT) instead of --in-place."
+_TO_OUT = "Write the result to another file (`write`)."
 
 
 def edit_in_place(

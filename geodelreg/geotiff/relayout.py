@@ -116,7 +116,8 @@ def check_movable(tiff: TiffFile, structure: Structure) -> None:
                 raise LossyOutputError(
                     f"{tiff.path} cannot be laid out again: its TIFF tag {entry.tag} may point to "
                     "data that would be lost",
-                    "Write it anew with creation options of your choice, e.g. --co COMPRESS=ZSTD.",
+                    "Write it anew with options of your choice, e.g. "
+                    "`creation_options=['COMPRESS=ZSTD']`.",
                 )
 
 

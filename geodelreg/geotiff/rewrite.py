@@ -61,7 +61,7 @@ def output_driver(target: Path, driver: str | None) -> str:
         if extension not in by_extension:
             raise UsageError(
                 f"{target}: no format is known for the extension .{extension}",
-                "Name the format, e.g. --of GTiff.",
+                "Name the format, e.g. `driver='GTiff'`.",
             )
         return _openable(target, by_extension[extension])
     with rasterio.Env() as env:

@@ -138,8 +138,8 @@ def keep(wanted: SpatialReference | None, out: Path, target: Path) -> list[str]:
         raise OutputUnwritableError(
             f"{target} cannot be written: its format does not keep the coordinate reference "
             f"system {wanted.name}, nor does a file {pam.name} beside it",
-            "Keep the format and the encoding of the source, and the geotransform: no --of, --co, "
-            "--georef or --warp.",
+            "Keep the format and the encoding of the source, and the geotransform: no `driver`, "
+            "`creation_options`, `georef` or `warp`.",
         )
     where = f"{target.name}: the coordinate reference system {wanted.name} is in {pam.name}"
     return [f"{where}, its format has no place for it; keep both files together"]

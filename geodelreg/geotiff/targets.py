@@ -52,7 +52,7 @@ class Inputs:
             what = "is the input" if found.exists() else "would be taken for a part of an input,"
             raise OutputIsInputError(
                 f"{target} {what} {found}",
-                "Choose another name, or correct the header with --in-place.",
+                "Choose another name, or correct the header with `write_in_place`.",
             )
 
 
@@ -96,7 +96,7 @@ def check_replaceable(target: Path, overwrite: bool, stale: Iterable[Path] = ())
         what = f"{target} exists"
         if in_the_way[0] != target:
             what = f"{in_the_way[0]} exists and would be taken for a part of {target.name}"
-        raise OutputExistsError(what, "Add --overwrite to replace it, or choose another name.")
+        raise OutputExistsError(what, "Add `overwrite=True` to replace it, or choose another name.")
 
 
 def make_folder(folder: Path) -> None:

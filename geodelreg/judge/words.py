@@ -100,7 +100,7 @@ def bands_warning(evidence: Evidence) -> tuple[str, ...]:
     note = (
         f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least)"
     )
-    return (f"{note}; the correction is not right for both, --band N matches on one",)
+    return (f"{note}; the correction is not right for both, `band=N` matches on one",)
 
 
 def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:

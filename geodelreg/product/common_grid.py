@@ -103,7 +103,7 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     if (last <= first).any():
         raise NoOverlapError(
             f"{what.sources[0].path} and {what.reference} share no ground",
-            "Check that both show the same place, or use --extent pan.",
+            "Check that both show the same place, or use `extent='pan'`.",
         )
     width, height = (int(n) for n in last - first)
     moved = pan.transform @ Affine.translation(*map(float, first))
@@ -126,7 +126,7 @@ def check_finer(what: Sharpening) -> None:
             raise UsageError(
                 f"the pixels of PAN ({what.reference.name}, {others:.3g} m) are larger than those "
                 f"of MS ({file.path.name}, {mine:.3g} m)",
-                "Give the finer raster last: geodelreg pansharpen MS PAN.",
+                "Give the finer raster last, as PAN.",
             )
 
 

@@ -61,8 +61,9 @@ def spectral_bands(files: Sequence[SpectralFile], chosen: Sequence[int]) -> list
     """
     found = [(number, band) for number, file in enumerate(files) for band in file.bands]
     if any(not 1 <= number <= len(found) for number in chosen):
+        text = ",".join(map(str, chosen))
         raise UsageError(
-            f"bands = {list(chosen)} are not all among the {len(found)} bands of MS",
+            f"`bands={text!r}` are not all among the {len(found)} bands of MS",
             f"Use numbers from 1 to {len(found)}.",
         )
     return [found[number - 1] for number in chosen] if chosen else found
@@ -129,7 +130,7 @@ def write_pansharpened(
         driver = output_driver(target, options.driver)
         if driver not in ("GTiff", "COG", "VRT"):
             raise UsageError(
-                f"driver = {driver} is no format of sharpened rasters",
+                f"`driver={driver!r}` is no format of sharpened rasters",
                 "Use GTiff, COG or VRT.",
             )
         with open_raster(what.reference) as pan:
@@ -230,7 +231,7 @@ def _write_vrt(
     """The lazy raster, and beside it the virtual rasters that lay its sources onto the grid."""
     if options.nodata is not None or options.creation_options:
         raise UsageError(
-            "nodata and creation options need pixels to be written, and a VRT has none",
+            "`nodata` and `creation_options` need pixels to be written, and a VRT has none",
             "Name a GeoTIFF (.tif), or drop them: a VRT tells by its mask what is not covered.",
         )
     recipe = recipe_of(what, out, grid, options.resampling)

@@ -58,16 +58,16 @@ def read_report(path: Path) -> Alignment:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise ReportError(
-                f"{path} is too large for a report", "Name the JSON file of --report."
+                f"{path} is too large for a report", "Name the JSON file of `write_report`."
             )
         report = json.loads(path.read_bytes())
     except OSError as error:
         raise ReportError(
-            f"{path} cannot be read ({error.strerror})", "Name the JSON file of --report."
+            f"{path} cannot be read ({error.strerror})", "Name the JSON file of `write_report`."
         ) from error
     except (ValueError, RecursionError) as error:
         raise ReportError(
-            f"{path} is no JSON ({error})", "Name the JSON file of --report."
+            f"{path} is no JSON ({error})", "Name the JSON file of `write_report`."
         ) from error
     version = report.get("schema_version") if isinstance(report, dict) else None
     if version != SCHEMA_VERSION:

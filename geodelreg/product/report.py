@@ -279,14 +279,14 @@ def next_line(alignment: Alignment, written: WriteOptions | None = None) -> str:
         return "Next: the resampled grid is north-up, ready for pansharpening with PAN."
     if not alignment.fits_a_header:
         return (
-            "Next: no geotransform holds this correction: resample with it (--warp), or pass "
-            "control points on (--gcps)."
+            "Next: no geotransform holds this correction: resample with it (`warp=True`), or "
+            "pass control points on (`export_gcps`)."
         )
     original, corrected = alignment.correction.original, alignment.correction.corrected
     if corrected.b or corrected.d:
-        remedy = "for them add --warp"
+        remedy = "for them add `warp=True`"
         if not (original.b or original.d):
-            remedy += ", or keep the grid north-up with --model scale"
+            remedy += ", or keep the grid north-up with `model='scale'`"
         return (
             "Next: the corrected grid is rotated, which GDAL's pansharpening and gdalbuildvrt "
             f"refuse: {remedy}."

@@ -108,7 +108,7 @@ class StoredCorrection:
             raise CorrectionMisfitError(
                 f"{name} does not lie where the correction {self.path} was found: they share "
                 f"{max(share, 0.0):.0%} of the smaller footprint",
-                "Apply the correction of this scene, or add --force.",
+                "Apply the correction of this scene, or add `force=True`.",
             )
 
     def inside(self, xy: FloatArray, crs_wkt: str) -> float:

@@ -221,7 +221,7 @@ def _target_grid(
             raise UnsupportedGeoreferenceError(
                 f"the corrected geotransform of {source} is too large to be covered by pixels: "
                 f"{tuple(correction.corrected)[:6]}",
-                "Check the geotransform with gdalinfo, or use --grid pan.",
+                "Check the geotransform with gdalinfo, or use `warp_grid='pan'`.",
             ) from error
     return grid
 

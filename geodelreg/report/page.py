@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions
 from geodelreg.product.check import Check
 from geodelreg.product.report import short
@@ -106,7 +107,7 @@ def page(alignment: Alignment, check: Check | None = None) -> str:
         bands=bands,
         checked=[] if check is None else check.bands or [],
         steps=_steps(alignment),
-        warnings=alignment.warnings,
+        warnings=[as_typed(warning) for warning in alignment.warnings],
         accuracy=_accuracy(alignment),
         masks=alignment.masks,
         inputs=list(_inputs(alignment)),

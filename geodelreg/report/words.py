@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from geodelreg.flags import arguments, as_typed
 from geodelreg.judge.words import region
-from geodelreg.options import AlignOptions, flags
+from geodelreg.options import AlignOptions
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import found_line, next_line, short, with_metres
 from geodelreg.report.frame import frame_of
@@ -90,9 +91,9 @@ REASONS = {
         "No surer keypoints object",
         "Distance from where distinct features, more certain ones, put the ground; 0 without any.",
     ),
-    "max_shift": ("Shift within your limit", "As asked with --max-shift."),
-    "max_rotation": ("Rotation within your limit", "As asked with --max-rotation."),
-    "max_scale": ("Scale within your limit", "As asked with --max-scale."),
+    "max_shift": ("Shift within your limit", "As asked with `max_shift_px`."),
+    "max_rotation": ("Rotation within your limit", "As asked with `max_rotation_deg`."),
+    "max_scale": ("Scale within your limit", "As asked with `max_scale`."),
     "two_motions": (
         "No motion beside the bend",
         "Share of the patches that lie elsewhere together and do not count as the ground's bend.",
@@ -174,7 +175,7 @@ def bar(reason: Reason) -> Bar:
         ratio = 0.0 if reason.passed else _WORST
     used = min(ratio, 1.0) if reason.passed else min(max(ratio, 1.0), _WORST)
     failure = FAILED.get(reason.name, f"{question}: no.")
-    return Bar(question, meaning, reason.message, failure, reason.passed, used)
+    return Bar(question, as_typed(meaning), reason.message, failure, reason.passed, used)
 
 
 def bars(alignment: Alignment) -> list[Bar]:
@@ -218,9 +219,9 @@ def story(alignment: Alignment, check: Check | None = None) -> list[str]:
 def advice(alignment: Alignment, check: Check | None = None) -> str:
     """What to do next."""
     if alignment.verdict.outcome is Outcome.REFUSED:
-        return alignment.verdict.remedy
+        return as_typed(alignment.verdict.remedy)
     if check is None:
-        return _sentence(next_line(alignment).removeprefix("Next: "))
+        return as_typed(_sentence(next_line(alignment).removeprefix("Next: ")))
     if check.outcome is CheckOutcome.MISALIGNED:
         return "Correct the header with geodelreg align."
     return "Use the raster as it is."
@@ -359,6 +360,5 @@ def command(alignment: Alignment) -> str:
         value = getattr(options, field.name)
         if field.name == "threads" or value == getattr(defaults, field.name):
             continue
-        for item in value if isinstance(value, tuple) else (value,):
-            words += [flags(field.name)[-1], str(item)]
+        words += arguments(field.name, value)
     return shlex.join(words)

@@ -8,45 +8,45 @@ _REMEDIES = (
     (
         {"local"},
         (
-            "--warp writes a field that follows the bend, --georef gcps its control points; "
-            "--on-local warn writes the best affine all the same, --max-residual PX allows more; a "
-            "raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
+            "`warp=True` writes a field that follows the bend, `georef='gcps'` its control points; "
+            "`on_local='warn'` writes the best affine all the same, `max_residual_px` allows more; "
+            "a raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
             "part by part."
         ),
     ),
     (
         {"two_motions", "local"},
         (
-            "Mask the part that moves (--mask), or cut the raster there (gdal_translate -srcwin) "
+            "Mask the part that moves (`mask`), or cut the raster there (gdal_translate -srcwin) "
             "and align each part."
         ),
     ),
     (
         {"bands", "bands_apart"},
         (
-            "The bands of MS do not agree, or show clouds: match on one of them (--band N); the "
+            "The bands of MS do not agree, or show clouds: match on one of them (`band=N`); the "
             "correction is then right for the bands that lie with it."
         ),
     ),
     (
         {"max_shift", "max_rotation", "max_scale"},
         (
-            "A correction was found that is larger than you allowed (--max-shift, --max-rotation, "
-            "--max-scale): allow more if the header may be so far off."
+            "A correction was found that is larger than you allowed (`max_shift_px`, "
+            "`max_rotation_deg`, `max_scale`): allow more if the header may be so far off."
         ),
     ),
     (
         {"rival", "shading"},
         (
             "The images fit elsewhere nearly as well: repeated texture, or one of them is shaded "
-            "like relief. Try --band with the band that looks most like PAN, or a larger part of "
+            "like relief. Try `band` with the band that looks most like PAN, or a larger part of "
             "the scene."
         ),
     ),
     (
         {"sigma_px", "coverage", "disagreement_px"},
         (
-            "Too little of the overlap shows common ground to know its corners: a simpler --model "
+            "Too little of the overlap shows common ground to know its corners: a simpler `model` "
             "needs less of it, and masks may hide too much."
         ),
     ),
@@ -54,8 +54,8 @@ _REMEDIES = (
 """What can be done when no other reasons than these refuse; the first that holds them counts."""
 
 _OTHERWISE = (
-    "Check that both show the same ground; try --band with the band that looks most like PAN, a "
-    "larger --search-radius, or a simpler --model; mask clouds (--mask)."
+    "Check that both show the same ground; try `band` with the band that looks most like PAN, a "
+    "larger `search_radius_px`, or a simpler `model`; mask clouds (`mask`)."
 )
 
 

@@ -12,6 +12,8 @@ import pytest
 import rasterio
 from pyproj import CRS
 
+from geodelreg import align
+from geodelreg.errors import AlignmentRefusedError
 from tests.cli.helpers import Command, snapshot
 from tests.integration.crs_zoo import ENGINEERING
 
@@ -94,6 +96,15 @@ def test_engineering_crs_against_a_projected_one_is_refused(geodelreg: Command, 
     assert "no transformation between the coordinate reference systems 'hall' and" in done.stderr
     assert "list index" not in done.stderr
     assert snapshot(pair) == before
+
+
+def test_one_refusal_speaks_of_arguments_and_of_flags(geodelreg: Command, pair: Path) -> None:
+    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", "--max-shift", "0.5", cwd=pair)
+    with pytest.raises(AlignmentRefusedError) as caught:
+        align(pair / "ms.tif", pair / "pan.tif", max_shift_px=0.5)
+    assert "(`max_shift_px`, `max_rotation_deg`, `max_scale`): allow more" in str(caught.value)
+    assert "(--max-shift, --max-rotation, --max-scale): allow more" in done.stderr
+    assert "`" not in done.stderr
 
 
 @pytest.mark.parametrize("crs", ["+proj=utm +zone=18", "+proj=longlat"])

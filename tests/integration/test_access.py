@@ -45,14 +45,14 @@ def test_no_request_is_sent_by_default(server: Server, address: str) -> None:
     name = address.format(url=server.address)
     with pytest.raises(AccessNotAllowedError, match="only local files") as caught:
         open_raster(name)
-    assert "--allow network" in caught.value.remedy
+    assert "`allow='network'`" in caught.value.remedy
     assert server.requests == []
 
 
 @pytest.mark.parametrize("name", ["/vsistdin/", "MEM:::DATAPOINTER=1", "PG:host=x", "vrt://a.tif"])
 def test_other_sources_are_refused_even_with_the_network(name: str) -> None:
     for allow in (LOCAL, NETWORK):
-        with pytest.raises(AccessNotAllowedError, match="--allow all"):
+        with pytest.raises(AccessNotAllowedError, match="`allow='all'`"):
             open_raster(name, allow=allow)
 
 

@@ -86,7 +86,7 @@ def test_clouds_over_two_fifths_do_not_win_without_a_mask(clouded: Clouded) -> N
 
     Without a mask a part that moves by itself may as well be torn ground: it is refused, and told.
     """
-    with pytest.raises(AlignmentRefusedError, match="--mask") as caught:
+    with pytest.raises(AlignmentRefusedError, match="`mask`") as caught:
         align(clouded.scene.ms, clouded.scene.pan)
     reasons = caught.value.alignment.verdict.reasons
     assert [reason.name for reason in reasons if not reason.passed] == ["two_motions"]

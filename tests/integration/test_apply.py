@@ -177,7 +177,7 @@ def test_a_jump_is_no_thin_plate_spline(scene: tuple[Path, Path]) -> None:
     alignment = replace(alignment, solution=replace(alignment.solution, map=torn))
     with pytest.raises(LossyOutputError, match="thin plate spline") as refused:
         geodelreg.write(alignment, scene[0].with_name("out.tif"), WriteOptions(georef="gcps"))
-    assert "--warp" in refused.value.remedy
+    assert "`warp=True`" in refused.value.remedy
     assert not scene[0].with_name("out.tif").exists()
 
 
@@ -186,7 +186,7 @@ def test_a_field_needs_warp(scene: tuple[Path, Path]) -> None:
     for target in (scene[0].with_name("out.tif"), None):
         with pytest.raises(UsageError, match="no header, can hold it") as refused:
             geodelreg.apply(report, scene[0], target)
-        assert "--warp" in refused.value.remedy
+        assert "`warp=True`" in refused.value.remedy
     assert not scene[0].with_name("out.tif").exists()
 
 
@@ -269,7 +269,7 @@ def test_files_of_another_place_are_refused_unless_forced(scene: tuple[Path, Pat
     for file, out in ((other, "out.tif"), (points, "out.csv")):
         with pytest.raises(CorrectionMisfitError, match=file.name) as refused:
             geodelreg.apply(report, file, file.with_name(out))
-        assert "--force" in refused.value.remedy
+        assert "`force=True`" in refused.value.remedy
         assert not file.with_name(out).exists()
         geodelreg.apply(report, file, file.with_name(out), force=True)
         assert file.with_name(out).exists()

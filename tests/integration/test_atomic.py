@@ -81,7 +81,7 @@ def test_text_appears(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     write_text_atomically(path, "é\n", overwrite=False)
     assert path.read_bytes() == "é\n".encode()
-    with pytest.raises(OutputExistsError, match=r"report\.json exists.*--overwrite"):
+    with pytest.raises(OutputExistsError, match=r"report\.json exists.*`overwrite=True`"):
         write_text_atomically(path, "new", overwrite=False)
     write_text_atomically(path, "new", overwrite=True)
     assert contents(tmp_path) == {"report.json": b"new"}
@@ -117,7 +117,7 @@ def test_existing_files_are_kept_without_overwrite(tmp_path: Path) -> None:
     restore(tmp_path, {"out.tif.aux.xml": b"left over"})
     stale = [tmp_path / "out.tif.aux.xml"]
     with (
-        pytest.raises(OutputExistsError, match=r"aux\.xml exists.*--overwrite"),
+        pytest.raises(OutputExistsError, match=r"aux\.xml exists.*`overwrite=True`"),
         staged(tmp_path / "out.tif", overwrite=False, stale=stale),
     ):
         pytest.fail("the body must not run")
@@ -171,7 +171,7 @@ def test_input_is_never_the_output(tmp_path: Path, link: str) -> None:
         (tmp_path / "sub").mkdir()
         target = tmp_path / "sub" / ".." / "ms.tif"
     before = source.read_bytes()
-    with pytest.raises(OutputIsInputError, match="--in-place"):
+    with pytest.raises(OutputIsInputError, match="`write_in_place`"):
         write_corrected(
             source, target, correction_of(source), GCPS, TAGS, WriteOptions(overwrite=True)
         )

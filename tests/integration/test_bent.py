@@ -80,8 +80,8 @@ def failed(alignment: Alignment) -> set[str]:
 def test_waves_are_refused_with_what_they_leave_and_what_helps(wavy: Made) -> None:
     error, alignment = refusal(wavy)
     assert failed(alignment) == {"local"}
-    assert "--on-local warn" in error.remedy
-    assert "--max-residual" in error.remedy
+    assert "`on_local='warn'`" in error.remedy
+    assert "`max_residual_px`" in error.remedy
     accuracy, true = alignment.accuracy, wavy.rms_px(wavy.pair.best_affine())
     assert accuracy.residual_rms_px == pytest.approx(true, rel=0.15)
     low, high = accuracy.residual_interval_px
@@ -110,7 +110,7 @@ def test_a_second_motion_is_refused_and_its_place_is_told(torn: Made) -> None:
     assert failed(alignment) == {"two_motions"}
     assert "16 px left and 12 px down of the rest" in str(error)
     assert "the lower 4" in str(error)
-    assert "--mask" in error.remedy
+    assert "`mask`" in error.remedy
 
 
 def test_check_calls_both_misaligned(wavy: Made, torn: Made) -> None:
@@ -183,7 +183,7 @@ def test_bands_that_lie_apart_are_refused_and_named_however_far(
     told = re.search(r"band 3 lies ([\d.]+) px right and ([\d.]+) px down of band", str(error))
     assert told is not None
     assert [float(number) for number in told.groups()] == pytest.approx(np.negative(shift), abs=0.2)
-    assert "--band" in error.remedy
+    assert "`band" in error.remedy
     alone = geodelreg.align(apart.ms, apart.pan, AlignOptions(band=1))
     assert np.abs(apart.pair.errors(alone.correction.corrected)).max() < 0.1
 

@@ -95,7 +95,7 @@ def test_waves_are_followed_and_the_standard_error_is_right(
 def test_without_an_output_for_it_the_refusal_names_what_carries_a_field(wavy: Made) -> None:
     with pytest.raises(AlignmentRefusedError, match="of the ground's bend") as caught:
         geodelreg.align(wavy.ms, wavy.pan)
-    assert "--warp" in caught.value.remedy
+    assert "`warp=True`" in caught.value.remedy
 
 
 def test_the_report_holds_the_map_itself(followed: Alignment) -> None:
@@ -140,7 +140,7 @@ def test_a_header_is_refused_before_the_work(way: list[str], asked: list[str]) -
     run = CliRunner().invoke(cli, ["align", "no.tif", "none.tif", *asked, *way])
     assert isinstance(run.exception, UsageError)
     assert run.exception.exit_code == 2
-    assert "--warp" in run.exception.remedy
+    assert "`warp=True`" in run.exception.remedy
 
 
 def test_no_header_is_written(followed: Alignment, tmp_path: Path) -> None:

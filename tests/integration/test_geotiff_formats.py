@@ -220,7 +220,7 @@ def test_gcps_place_other_formats_too(tmp_path: Path) -> None:
 
 def test_unknown_formats_are_wrong_usage(tmp_path: Path) -> None:
     source = make_tiff(tmp_path / "ms.tif")
-    with pytest.raises(UsageError, match=r"\.xyzzy.*--of"):
+    with pytest.raises(UsageError, match=r"\.xyzzy.*`driver='GTiff'`"):
         write(source, tmp_path / "out.xyzzy")
     with pytest.raises(UsageError, match="Nonsense"):
         write(source, tmp_path / "out.tif", driver="Nonsense")

@@ -206,7 +206,7 @@ def test_rpcs_are_warned_about_or_stripped(tmp_path: Path, place: str) -> None:
         (tmp_path / "ms.tif.aux.xml").write_text(text)
     warnings = write(source)
     assert len(warnings) == 1
-    assert "--strip-rpc" in warnings[0]
+    assert "`strip_rpc=True`" in warnings[0]
     with rasterio.open(tmp_path / "out.tif") as dataset:
         assert dataset.rpcs is not None
     assert write(source, overwrite=True, strip_rpc=True) == []

@@ -92,7 +92,7 @@ def test_the_report_tells_the_map_and_no_geotransform(found: Alignment) -> None:
     assert correction["corrected_geotransform"] is None
     assert correction["pixel_map"]["kind"] == "projective"
     np.testing.assert_allclose(correction["pixel_map"]["matrix"], TRUTH, rtol=0, atol=0.03)
-    assert "--gcps" in summary_text(found)
+    assert "`export_gcps`" in summary_text(found)
 
 
 def test_control_points_carry_it(found: Alignment, tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_control_points_carry_it(found: Alignment, tmp_path: Path) -> None:
 def test_no_header_is_written(found: Alignment, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no header, can hold it") as refused:
         geodelreg.write(found, tmp_path / "out.tif")
-    assert "--gcps" in refused.value.remedy
+    assert "`export_gcps`" in refused.value.remedy
     with pytest.raises(UsageError):
         geodelreg.write_in_place(found)
     assert not list(tmp_path.iterdir())

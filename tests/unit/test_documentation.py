@@ -11,10 +11,10 @@ import click
 import pytest
 
 from geodelreg import errors
+from geodelreg.flags import flags
 from geodelreg.judge.verdict import Evidence, judge
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg_cli.main import COMMANDS, cli
-from geodelreg_cli.options import flags
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -163,19 +163,19 @@ def test_of_a_refused_alignment_nothing_is_written(tmp_path: Path) -> None:
         geodelreg.write_in_place(refused())
     with pytest.raises(AlignmentRefusedError) as caught:
         geodelreg.export_gcps(refused(), points)
-    assert "--search-radius" in caught.value.remedy
+    assert "`search_radius_px`" in caught.value.remedy
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("names", "word"),
     [
-        ({"moved": 0.3}, "--mask"),
-        ({"moved": 0.3, "residual_low_px": 2.0}, "--mask"),
-        ({"residual_low_px": 2.0}, "--on-local"),
-        ({"bands": 3.0}, "--band N"),
+        ({"moved": 0.3}, "`mask`"),
+        ({"moved": 0.3, "residual_low_px": 2.0}, "`mask`"),
+        ({"residual_low_px": 2.0}, "`on_local='warn'`"),
+        ({"bands": 3.0}, "`band=N`"),
         ({"rival": 0.99}, "repeated texture"),
-        ({"sigma_px": 2.0}, "simpler --model"),
+        ({"sigma_px": 2.0}, "simpler `model`"),
         ({"support": 0.1}, "same ground"),
     ],
 )
@@ -187,7 +187,7 @@ def test_a_refusal_says_what_can_be_done_here(names: dict[str, float], word: str
 def test_a_correction_beyond_what_was_allowed_names_the_limits() -> None:
     far = replace(GOOD, shift_px=40.0)
     found = verdict(judge(far, AlignOptions(max_shift_px=9.0)), moves=True)
-    assert "--max-shift" in found.remedy
+    assert "`max_shift_px`" in found.remedy
 
 
 @pytest.mark.parametrize("shift", [-0.5, 0.0, 0.5, 2.0])

@@ -285,8 +285,8 @@ def test_summary_of_a_shift() -> None:
 def test_summary_of_a_rotation_names_the_remedies() -> None:
     text = summary_text(alignment(model="affine", corrected=rotated(0.3)))
     assert "turned 0.3000° counterclockwise" in text
-    assert "--warp" in text
-    assert "--model scale" in text
+    assert "`warp=True`" in text
+    assert "`model='scale'`" in text
 
 
 def test_summary_of_a_rotation_to_the_right_has_no_sign() -> None:
@@ -296,7 +296,7 @@ def test_summary_of_a_rotation_to_the_right_has_no_sign() -> None:
 
 def test_summary_of_what_was_resampled_or_has_control_points_recommends_neither() -> None:
     turned = alignment(model="affine", corrected=rotated(0.3))
-    assert "--warp" not in summary_text(turned, WriteOptions(warp=True))
+    assert "`warp=True`" not in summary_text(turned, WriteOptions(warp=True))
     last = summary_text(alignment(), WriteOptions(georef="gcps")).splitlines()[-1]
     assert "control points" in last
     assert "north-up" not in last
@@ -306,8 +306,8 @@ def test_summary_of_a_raster_that_was_rotated_before() -> None:
     before, after = rotated(5.0), Affine.translation(1.0, 2.0) @ rotated(5.0)
     made = alignment(source=Grid(before, (80, 100), UTM16), model="shift", corrected=after)
     text = summary_text(made)
-    assert "--warp" in text
-    assert "--model scale" not in text
+    assert "`warp=True`" in text
+    assert "`model='scale'`" not in text
 
 
 def test_summary_when_nothing_is_to_do() -> None:
@@ -326,7 +326,7 @@ def test_summary_of_a_refusal_says_why_and_what_to_try() -> None:
     assert text.startswith("Refused")
     assert "0 tie points agree, 8 are needed" in text
     assert "not measured" not in text
-    assert "--search-radius" in text
+    assert "`search_radius_px`" in text
 
 
 def test_summary_without_check_points() -> None:

@@ -294,9 +294,10 @@ def test_each_reason_of_the_gate_has_its_words() -> None:
 def test_the_command_has_every_option_that_was_changed() -> None:
     asked: dict[str, Any] = {
         "model": "shift", "masks": ("my clouds.tif", "b.tif=3"), "threads": 3, "max_shift_px": 9.5,
+        "north_up": True,
     }  # fmt: skip
     told = command(alignment(options=AlignOptions(**asked)))
     assert told == (
         "geodelreg align scene/ms.tif scene/pan.tif --dry-run --report again.html --model shift "
-        "--mask 'my clouds.tif' --mask b.tif=3 --max-shift 9.5"
+        "--north-up --mask 'my clouds.tif' --mask b.tif=3 --max-shift 9.5"
     )

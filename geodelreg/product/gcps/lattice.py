@@ -67,7 +67,7 @@ def gcps_of_map(name: str, placement: PixelMap, grid: Grid) -> tuple[Gcp, ...]:
     raise LossyOutputError(
         f"{name}: a thin plate spline through control points is {best:.2g} px off the correction "
         f"at best, and may be {AGREEMENT_PX:g}",
-        "Resample (--warp): jumps and short waves are exact there.",
+        "Resample (`warp=True`): jumps and short waves are exact there.",
     )
 
 
