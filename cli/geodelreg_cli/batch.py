@@ -184,7 +184,7 @@ def batch(manifest: Path | None, **given: Any) -> int:
         ready.prepare()
     except ManifestError as error:
         for problem in error.problems:
-            click.echo(shown(problem), err=True)
+            click.echo(shown(as_typed(problem)), err=True)
         raise
     if given["dask"] and not (given["verbose"] or given["debug"]):
         _silence_dask()

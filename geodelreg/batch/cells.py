@@ -112,4 +112,4 @@ def _value(field: Field[Any], cell: Any) -> Any:
             return text
     except (ValueError, KeyError, OverflowError):
         pass
-    raise UsageError(f"{name} = {str(cell)[:60]!r} is no value of that option")
+    raise UsageError(f"`{name}={str(cell)[:60]!r}` is no value of that option")

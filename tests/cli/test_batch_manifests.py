@@ -56,7 +56,7 @@ def test_all_mistakes_are_told_at_once(folder: Path, geodelreg: Command) -> None
         file.write(b"ms.tif,pan.tif\nms.tif,\xff.tif,out/8.tif,,,,,\n")
     done = refused(geodelreg, manifest)
     for line, words in {
-        3: "model = 'round'", 4: "ratio = nan", 5: "band = '2.5'", 6: "warp = 'perhaps'",
+        3: "--model round", 4: "--ratio nan", 5: "--band 2.5", 6: "--warp perhaps",
         7: "no value for pan", 8: "no value for out", 9: "output of line 2 already",
         10: "lies below", 11: "pan.tif exists", 12: "there.tif exists", 13: "pairs.csv exists",
         14: "a file of the batch itself", 15: "9-3", 16: "2 cells for 8 columns", 17: "not UTF-8",

@@ -91,7 +91,7 @@ def test_options_take_paths_and_no_single_name() -> None:
     made = AlignOptions(masks=(Path("a.tif"), "b.tif=3"), pan_masks=[Path("c.tif")])  # type: ignore[arg-type]
     assert made.masks == ("a.tif", "b.tif=3")
     assert made.pan_masks == ("c.tif",)
-    with pytest.raises(UsageError, match=r"masks = 'a\.tif' is one name"):
+    with pytest.raises(UsageError, match=r"`masks='a\.tif'` is one name"):
         AlignOptions(masks="a.tif")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="pan_masks"):
         AlignOptions(pan_masks=Path("a.tif"))  # type: ignore[arg-type]
