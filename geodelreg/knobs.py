@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypedDict
 
 
@@ -52,8 +53,8 @@ class PansharpenKnobs(TypedDict, total=False):
     driver: str | None
     creation_options: tuple[str, ...]
     resampling: str
-    weights: str
-    bands: str
+    weights: str | Sequence[float]
+    bands: str | Sequence[int]
     extent: str
     nodata: float | None
     bit_depth: int | None

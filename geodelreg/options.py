@@ -6,6 +6,7 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -52,10 +53,25 @@ def _check_masks(options: object, name: str) -> None:
     object.__setattr__(options, name, masks)
 
 
-def _check_range(options: object, name: str, low: float, high: float) -> None:
+def _check_number(options: object, name: str) -> None:
     value = getattr(options, name)
     if value is not None and not isinstance(value, int | float):
         raise TypeError(f"`{name}={value!r}` is no number")
+
+
+def _keep_list(options: object, name: str) -> None:
+    """Keep a sequence of numbers as a tuple; on the command line it is text."""
+    value = getattr(options, name)
+    if not isinstance(value, str):
+        try:
+            object.__setattr__(options, name, tuple(value))
+        except TypeError:
+            raise TypeError(f"`{name}={value!r}` is neither text nor numbers") from None
+
+
+def _check_range(options: object, name: str, low: float, high: float) -> None:
+    _check_number(options, name)
+    value = getattr(options, name)
     if value is not None and not low <= value <= high:
         raise UsageError(f"`{name}={value}` is out of range", f"Use {low:g} to {high:g}.")
 
@@ -309,12 +325,12 @@ class PansharpenOptions:
         (), "Creation option of the format, KEY=VALUE, as in GDAL; may be repeated."
     )
     resampling: str = _knob("cubic", "Resampling of MS onto the grid of PAN.", RESAMPLINGS)
-    weights: str = _knob(
+    weights: str | Sequence[float] = _knob(
         "auto",
         "Weights of the sharpened bands in the image that PAN is divided by: auto fits them so "
         "that together the bands look like PAN; equal; or numbers, W1,W2,...",
     )
-    bands: str = _knob(
+    bands: str | Sequence[int] = _knob(
         "all", "Bands of MS to sharpen, from 1, as N,N,...; all but alpha otherwise."
     )
     extent: str = _knob(
@@ -331,6 +347,9 @@ class PansharpenOptions:
         _check_choice(self, "resampling")
         _check_choice(self, "extent")
         _check_range(self, "bit_depth", 1, 32)
+        _check_number(self, "nodata")
+        _keep_list(self, "weights")
+        _keep_list(self, "bands")
         for option in self.creation_options:
             if "=" not in option:
                 raise UsageError(f"creation option {option!r} is not KEY=VALUE")
@@ -347,8 +366,8 @@ class PansharpenOptions:
             They are none, or sum up to nothing.
         """
         try:
-            values = tuple(float(text) for text in self.weights.split(","))
-        except ValueError:
+            values = tuple(float(each) for each in _listed(self.weights))
+        except (TypeError, ValueError):
             values = ()
         if not values or not all(0 <= value < float("inf") for value in values) or not sum(values):
             raise UsageError(
@@ -366,7 +385,11 @@ class PansharpenOptions:
         """
         if self.bands == "all":
             return ()
-        numbers = self.bands.split(",")
-        if not all(text.strip().isdigit() and int(text) > 0 for text in numbers):
+        numbers = [str(each).strip() for each in _listed(self.bands)]
+        if not all(text.isdecimal() and int(text) > 0 for text in numbers):
             raise UsageError(f"`bands={self.bands!r}` are no bands", "Use numbers such as 1,2,3.")
         return tuple(int(text) for text in numbers)
+
+
+def _listed(value: str | Sequence[float]) -> Sequence[Any]:
+    return value.split(",") if isinstance(value, str) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -14,21 +15,31 @@ from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
 from geodelreg.geotiff.atomic import together
+from geodelreg.geotiff.rewrite import output_driver
 from geodelreg.knobs import PansharpenKnobs
-from geodelreg.options import PansharpenOptions, check_header_holds
+from geodelreg.options import PansharpenOptions
 from geodelreg.pair import Progress
 from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
 from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
 from geodelreg.product.provenance import provenance_tags
+from geodelreg.product.scratch import file_of, scratch_folder
+from geodelreg.raster.inputs import AnyRaster, Opened, opened, rasters_of
 from geodelreg.raster.opening import dataset_grid, open_dataset
 from geodelreg.raster.reader import check_band, open_raster
 from geodelreg.values.result import Alignment, Correction
-from geodelreg.writing import AnyPath, correction_of_file, input_paths, masks_of, paths_of
+from geodelreg.writing import (
+    AnyPath,
+    check_accepted,
+    correction_of_file,
+    input_paths,
+    masks_of,
+    placement_of,
+)
 
 
 def pansharpen(
-    source: AnyPath | Sequence[AnyPath],
-    reference: AnyPath,
+    source: AnyRaster | Sequence[AnyRaster],
+    reference: AnyRaster,
     target: AnyPath,
     options: PansharpenOptions | None = None,
     *,
@@ -42,12 +53,14 @@ def pansharpen(
 
     Parameters
     ----------
-    source : path or sequence of paths
-        The MS raster, or one file per band.
-    reference : path
+    source : raster or sequence of rasters
+        The MS raster, or one per band, as for `align`.  What is in no file is first written to a
+        temporary one, window by window.
+    reference : raster
         The PAN raster.
     target : path
-        GeoTIFF, COG or VRT.
+        GeoTIFF, COG or VRT.  A VRT names its sources: these must be files, and it holds no
+        correction that no geotransform holds.
     options : PansharpenOptions, optional
     alignment : Alignment, optional
         Of these rasters, as returned by `align`; without it MS lies where its header says.
@@ -62,31 +75,81 @@ def pansharpen(
 
     Raises
     ------
-    OutputExistsError, OutputIsInputError, OutputUnwritableError, NoOverlapError, UsageError, ...
+    AlignmentRefusedError
+        The alignment was refused: there is no correction.
+    UsageError
+        Also when the alignment is of other rasters.
+    OutputExistsError, OutputIsInputError, OutputUnwritableError, NoOverlapError, ...
         Nothing is then changed on disk.
+    TypeError
+        When an argument is of the wrong type.
     """
     options = replace(options or PansharpenOptions(), **knobs)
     if alignment is not None:
-        check_header_holds(alignment.solution.model)
-    paths = [as_path(path) for path in paths_of(source)]
-    masks = () if alignment is None else masks_of(alignment)
-    names = [*map(str, paths), str(reference), *masks]
-    with allowing(allow), together([Path(target)], lambda: input_paths(names, allow)):
-        with open_raster(reference, allow=allow) as pan:
-            check_band(pan, pan_band)
+        check_accepted(alignment)
+    masks = [] if alignment is None else masks_of(alignment)
+    with allowing(allow), ExitStack() as stack:
+        rasters = [opened(one, stack, allow) for one in rasters_of(source)]
+        pan = opened(reference, stack, allow)
+        if alignment is not None:
+            _check_same(alignment, rasters)
+        if output_driver(Path(target), options.driver) == "VRT":
+            _check_lazy(Path(target), [*rasters, pan], alignment)
+        names = [one.name for one in (*rasters, pan) if one.is_file]
+        run = together([Path(target)], lambda: input_paths([*names, *masks], allow))
+        stack.enter_context(run)
+        folder = stack.enter_context(scratch_folder())
+        paths = [_path(one, folder / f"ms{n}.tif") for n, one in enumerate(rasters, start=1)]
+        pan_path = _path(pan, folder / "pan.tif")
+        with open_raster(pan_path, allow=allow) as reader:
+            check_band(reader, pan_band)
         files = [_spectral_file(path, alignment, allow) for path in paths]
         bands = spectral_bands(files, options.given_bands())
-        what = Sharpening(files, Path(reference), pan_band, bands)
+        what = Sharpening(files, pan_path, pan_band, bands)
         check_finer(what)
         weights = _weights(what, options)
         tags = {} if alignment is None else provenance_tags(alignment)
         write_pansharpened(what, Path(target), weights, tags, options, progress)
 
 
+def _check_same(alignment: Alignment, rasters: Sequence[Opened]) -> None:
+    """Refuse an alignment of other rasters, or of these before their headers were corrected."""
+    names, known = [one.name for one in rasters], alignment.source
+    same = len(known.paths) == len(rasters)
+    if same and len(rasters) == 1:
+        grid = rasters[0].grid()
+        same = (grid.transform, grid.shape) == (known.grid.transform, known.grid.shape)
+    if not same:
+        raise UsageError(
+            f"the alignment is of {', '.join(known.paths)}, and {', '.join(names)} lies elsewhere",
+            "Align these rasters, or leave the alignment out where they are corrected already.",
+        )
+
+
+def _check_lazy(target: Path, rasters: Sequence[Opened], alignment: Alignment | None) -> None:
+    """Refuse a VRT of what it cannot name or place."""
+    unnamed = [one.name for one in rasters if not one.is_file]
+    why = f"{', '.join(unnamed)} is no file that it could name" if unnamed else ""
+    if alignment is not None and not alignment.fits_a_header:
+        why = f"no geotransform in it holds the model {alignment.correction.model}"
+    if why:
+        raise UsageError(f"{target} would be a VRT, and {why}", "Name a GeoTIFF (.tif).")
+
+
+def _path(raster: Opened, scratch: Path) -> Path:
+    """The file of a raster; one is written where there is none."""
+    if raster.is_file:
+        return as_path(raster.name)
+    file_of(raster, scratch)
+    return scratch
+
+
 def _spectral_file(path: Path, alignment: Alignment | None, allow: str) -> SpectralFile:
     with open_dataset(str(path), allow=allow) as dataset:
         if alignment is not None:
-            return SpectralFile.of(path, dataset, correction_of_file(alignment, path)[0])
+            correction, _ = correction_of_file(alignment, path)
+            placement = placement_of(alignment, correction)
+            return SpectralFile.of(path, dataset, correction, placement)
         grid = dataset_grid(str(path), dataset)
         as_it_is = Correction("none", grid.crs_wkt, grid.transform, grid.transform)
         return SpectralFile.of(path, dataset, as_it_is)

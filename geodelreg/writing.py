@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from os import PathLike
@@ -23,13 +23,6 @@ from geodelreg.values.points import Gcp
 from geodelreg.values.result import Alignment, Correction, Outcome
 
 AnyPath = str | PathLike[str]
-
-
-def paths_of(source: AnyPath | Sequence[AnyPath]) -> tuple[str, ...]:
-    """Names of one MS file or several."""
-    if isinstance(source, str) or hasattr(source, "__fspath__"):
-        return (str(source),)
-    return tuple(str(path) for path in source)
 
 
 @as_allowed
@@ -72,7 +65,7 @@ def write(
     from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
 
-    _check_accepted(alignment)
+    check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
     check_is_file(alignment)
     if not (options.warp or options.georef == "gcps"):
@@ -123,7 +116,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.geotiff.atomic import tidy, together
     from geodelreg.geotiff.inplace import edit_in_place
 
-    _check_accepted(alignment)
+    check_accepted(alignment)
     _check_header_holds(alignment)
     check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
@@ -209,14 +202,19 @@ def export_gcps(
     from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
-    _check_accepted(alignment)
+    check_accepted(alignment)
     gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
     with together(inputs=lambda: _inputs(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 
 
-def _check_accepted(alignment: Alignment) -> None:
-    """Write nothing of a refused alignment: its map is no correction."""
+def check_accepted(alignment: Alignment) -> None:
+    """Write nothing of a refused alignment: its map is no correction.
+
+    Raises
+    ------
+    AlignmentRefusedError
+    """
     if not alignment.verdict.accepted:
         name = Path(alignment.source.paths[0]).name
         raise AlignmentRefusedError(

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.flags import as_typed
@@ -24,6 +23,7 @@ from geodelreg_cli.options import (
     add_options,
     build,
     flag,
+    is_default,
     knob_option,
     knob_options,
     ms_and_pan,
@@ -185,7 +185,7 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     options = build(AlignOptions, given)
     if not given["dry_run"] and not _carries_all(write_options):
         check_header_holds("field" if options.on_local == "field" else options.model)
-    if _carries_all(write_options) and _is_default("on_local"):
+    if _carries_all(write_options) and is_default("on_local"):
         options = replace(options, on_local="field")
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
@@ -210,12 +210,6 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
 def _carries_all(options: WriteOptions) -> bool:
     """True of outputs that hold what no geotransform does."""
     return options.warp or options.georef == "gcps"
-
-
-def _is_default(name: str) -> bool:
-    """True of an option that the user has not given."""
-    source = click.get_current_context().get_parameter_source(name)
-    return source in (None, ParameterSource.DEFAULT)
 
 
 def _check_outputs(request: Request) -> list[Path]:

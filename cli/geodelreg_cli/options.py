@@ -14,6 +14,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from geodelreg.errors import UsageError
 from geodelreg.flags import UNITS, as_typed, flags
@@ -217,6 +218,12 @@ def add_options(options: Iterable[SectionOption]) -> Callable[[click.Command], c
         return command
 
     return decorate
+
+
+def is_default(name: str) -> bool:
+    """True of an option that the user has not given."""
+    source = click.get_current_context().get_parameter_source(name)
+    return source in (None, ParameterSource.DEFAULT)
 
 
 def build(options: type[_Options], given: Mapping[str, Any]) -> _Options:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from geodelreg.flags import as_typed
-from geodelreg.options import AlignOptions, PansharpenOptions
+from geodelreg.options import AlignOptions, PansharpenOptions, check_header_holds
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
     SectionCommand,
     SectionOption,
     add_options,
     build,
+    is_default,
     knob_option,
     knob_options,
     ms_and_pan,
@@ -82,11 +85,16 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
 
     MS is resampled once, from where it really lies onto PAN's pixels; then every band is multiplied
     by PAN over the weighted sum of the bands (GDAL's weighted Brovey). An alignment that the images
-    do not support is refused, and nothing is written.
+    do not support is refused, and nothing is written. Where one affine leaves too much, MS follows
+    a field (not into a VRT).
     """
     start_run(given)
     sources, reference = ms_and_pan(rasters)
     options, align_options = build(PansharpenOptions, given), build(AlignOptions, given)
+    if _is_lazy(given):
+        check_header_holds("field" if align_options.on_local == "field" else align_options.model)
+    elif is_default("on_local"):
+        align_options = replace(align_options, on_local="field")
     import geodelreg
     from geodelreg.pair import part_of
     from geodelreg_cli.outputs import check_targets
@@ -115,3 +123,9 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
         from geodelreg.product.report import summary_text
 
         click.echo(as_typed(summary_text(alignment)), err=True)
+
+
+def _is_lazy(given: Mapping[str, Any]) -> bool:
+    """True of a VRT, whose geotransforms must hold the correction."""
+    suffix: str = given["output"].suffix
+    return (given["driver"] or suffix.removeprefix(".")).upper() == "VRT"

@@ -17,16 +17,23 @@ from geodelreg.door.opening import open_raster
 from geodelreg.errors import NoOverlapError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.geo.grid import gsd_px_m, outline
+from geodelreg.geo.grid import gsd_px_m
 from geodelreg.geotiff import metadata
 from geodelreg.geotiff.header import Provenance
 from geodelreg.geotiff.view import corrected_view
-from geodelreg.product.warp import TOLERANCE_PX, Validity, warped_onto
+from geodelreg.options import WriteOptions
+from geodelreg.product.warp import (
+    TOLERANCE_PX,
+    Validity,
+    edge_on_ground,
+    warp_pixels,
+    warped_onto,
+)
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Correction
 
 _ROUNDING = 1e-3  # of pixel sizes in unlike CRSs
-_EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRSs are curved
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +45,8 @@ class SpectralFile:
     path : Path
     correction : Correction
         Where its pixels lie.
+    placement : PixelMap or None
+        Its pixels to those of its original header, where no geotransform holds that.
     shape : tuple of int
         ``(height, width)`` in pixels.
     bands : sequence of int
@@ -49,20 +58,23 @@ class SpectralFile:
 
     path: Path
     correction: Correction
+    placement: PixelMap | None
     shape: tuple[int, int]
     bands: Sequence[int]
     names: Sequence[str | None]
     nodata: float | None
 
     @classmethod
-    def of(cls, path: Path, dataset: Any, correction: Correction) -> SpectralFile:
+    def of(
+        cls, path: Path, dataset: Any, correction: Correction, placement: PixelMap | None = None
+    ) -> SpectralFile:
         """What must be known of an open file."""
         from rasterio.enums import ColorInterp
 
         meanings = zip(dataset.indexes, dataset.colorinterp, strict=True)
         bands = [band for band, meaning in meanings if meaning is not ColorInterp.alpha]
         names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
-        return cls(path, correction, dataset.shape, bands, names, dataset.nodata)
+        return cls(path, correction, placement, dataset.shape, bands, names, dataset.nodata)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +104,8 @@ def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
         return grid
     low, high = np.zeros(2), np.array(pan.shape[::-1], dtype=np.float64)
     for file in what.sources:
-        own = Grid(file.correction.corrected, file.shape, file.correction.crs_wkt)
-        edge = apply_affine(own.transform, outline(own, _EDGE_PLACES))
-        ground = map_points(edge, own.crs_wkt, grid.crs_wkt)
+        edge = edge_on_ground(file.correction, file.shape, file.placement)
+        ground = map_points(edge, file.correction.crs_wkt, grid.crs_wkt)
         seen = apply_affine(~pan.transform, ground)
         seen = seen[np.isfinite(seen).all(axis=1)]
         if len(seen):
@@ -131,17 +142,26 @@ def check_finer(what: Sharpening) -> None:
 
 
 @contextmanager
-def on_grid(what: Sharpening, grid: Grid, resampling: str) -> Iterator[list[Any]]:
-    """The MS files, where their corrections put them, resampled onto a grid when read."""
+def on_grid(what: Sharpening, grid: Grid, resampling: str, scratch: Path) -> Iterator[list[Any]]:
+    """The MS files, where their corrections put them, resampled onto a grid when read.
+
+    What no geotransform holds is resampled at once, into a file of the folder `scratch`.
+    """
     with ExitStack() as stack:
         files = []
-        for file in what.sources:
+        for number, file in enumerate(what.sources, start=1):
             content = Provenance(file.correction, (), {})
+            if file.placement is not None:
+                warped = scratch / f"placed{number}.tif"
+                options = WriteOptions(warp=True, resampling=resampling)
+                warp_pixels(file.path, warped, content, grid, {}, options, file.placement)
+                files.append(stack.enter_context(open_raster(warped)))
+                continue
             view = corrected_view(file.path, content, mask_rules=True)
             name, _ = stack.enter_context(view)
             dataset = stack.enter_context(open_raster(name))
-            warped = warped_onto(dataset, grid, Validity.of(dataset), resampling)
-            files.append(stack.enter_context(warped))
+            lazy = warped_onto(dataset, grid, Validity.of(dataset), resampling)
+            files.append(stack.enter_context(lazy))
         yield files
 
 
@@ -174,10 +194,11 @@ def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recip
 
     files = [out.with_name(f"{out.name}.ms{n}.vrt") for n in range(1, len(what.sources) + 1)]
     covers: list[tuple[Path, int]] = []
-    with on_grid(what, grid, resampling) as warped:
+    with on_grid(what, grid, resampling, out.parent) as warped:
         for number, (path, lazy) in enumerate(zip(files, warped, strict=True)):
             rasterio.shutil.copy(lazy, path, driver="VRT")
-            _name_source(path, what.sources[number].path)
+            if what.sources[number].placement is None:
+                _name_source(path, what.sources[number].path)
             used = [band for file, band in what.bands if file == number]
             covers += [(path, band) for band in (used if lazy.nodata is not None else used[:1])]
     pan = (what.reference, what.pan_band)

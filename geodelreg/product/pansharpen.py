@@ -37,6 +37,7 @@ from geodelreg.product.common_grid import (
     recipe_of,
     target_grid,
 )
+from geodelreg.product.scratch import scratch_folder
 from geodelreg.product.warp import Validity, warped_onto
 from geodelreg.values.raster import Float32Array, Grid
 
@@ -82,7 +83,7 @@ def matched_samples(what: Sharpening) -> tuple[Float32Array, Float32Array]:
         height, width = (max(1, round(side / factor)) for side in pan.shape)
         to_full = Affine.scale(pan.width / width, pan.height / height)
         grid = Grid(pan.transform @ to_full, (height, width), pan.crs.to_wkt())
-        with on_grid(what, grid, "average") as files:
+        with scratch_folder() as folder, on_grid(what, grid, "average", folder) as files:
             bands = np.stack([files[file].read(band) for file, band in what.bands])
             masks = [files[file].read_masks(band) > 0 for file, band in what.bands]
         with warped_onto(pan, grid, Validity.of(pan), "average") as averaged:
@@ -284,7 +285,7 @@ def _write_tiff(
     lazy.write_text(_pansharpened_xml(what, recipe, weights, options, names, {}), encoding="utf-8")
     height, width = grid.shape
     with open_raster(lazy) as sharp, ExitStack() as stack:
-        nodata = options.nodata if options.nodata is not None else _declared_nodata(what, sharp)
+        nodata = _nodata(what, sharp, options)
         profile = _profile(sharp, grid, nodata) | {
             key.lower(): value for key, value in user_creation(options).items()
         }
@@ -308,16 +309,22 @@ def _write_tiff(
                     progress(number / len(corners), "sharpening")
 
 
-def _declared_nodata(what: Sharpening, sharp: Any) -> float | None:
-    """No-data value of the first MS file, if the sharpened type can hold it."""
-    nodata = what.sources[0].nodata
-    if nodata is None:
-        return None
+def _nodata(what: Sharpening, sharp: Any, options: PansharpenOptions) -> float | None:
+    """No-data value as asked for; else that of the first MS file, if the sharpened type has it."""
+    asked, declared = options.nodata, what.sources[0].nodata
     kind = np.dtype(sharp.dtypes[0])
+    if asked is None:
+        return None if declared is None or not _holds(kind, declared) else float(declared)
+    if not _holds(kind, asked):
+        raise UsageError(f"`nodata={asked}` is no value of {kind}", "Use one that the bands have.")
+    return float(asked)
+
+
+def _holds(kind: np.dtype[Any], value: float) -> bool:
     if kind.kind == "f":
-        return float(nodata)
+        return True
     limits = np.iinfo(kind)
-    return float(nodata) if nodata == int(nodata) and limits.min <= nodata <= limits.max else None
+    return math.isfinite(value) and value == int(value) and limits.min <= value <= limits.max
 
 
 def _mark(data: NDArray[Any], valid: NDArray[np.bool_], nodata: float) -> None:

@@ -31,7 +31,7 @@ from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product.lookup import looked_up, lookups_of
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import BoolArray, Grid
+from geodelreg.values.raster import BoolArray, FloatArray, Grid
 from geodelreg.values.result import Correction
 
 TOLERANCE_PX = 1e-3
@@ -144,7 +144,7 @@ def write_warped(
                 draft = out.parent.parent / "scratch" / name
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
-                notes = _warp(source, draft, content, grid, creation, options, placement)
+                notes = warp_pixels(source, draft, content, grid, creation, options, placement)
             settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
             content = Provenance(settled, (), tags)
             kept = keep(onto, draft, target)
@@ -172,11 +172,7 @@ def north_up_grid(
     placement : PixelMap, optional
         As for `write_warped`.
     """
-    edge = outline(Grid(correction.original, shape, correction.crs_wkt), _EDGE_PLACES)
-    if placement is None:
-        places = apply_affine(correction.corrected, edge)
-    else:
-        places = apply_affine(correction.original, placement.forward(edge))
+    places = edge_on_ground(correction, shape, placement)
     (left, bottom), (right, top) = places.min(axis=0), places.max(axis=0)
     original = correction.original
     if original.b == 0 and original.d == 0 and original.a > 0 and original.e < 0:
@@ -192,6 +188,16 @@ def north_up_grid(
     transform = Affine(pixel_x, 0.0, float(x), 0.0, -pixel_y, float(y))
     shape = (max(1, last_row - first_row), max(1, last_column - first_column))
     return Grid(transform, shape, correction.crs_wkt)
+
+
+def edge_on_ground(
+    correction: Correction, shape: tuple[int, int], placement: PixelMap | None
+) -> FloatArray:
+    """(N, 2) map coordinates around what a raster shows, where it really lies."""
+    edge = outline(Grid(correction.original, shape, correction.crs_wkt), _EDGE_PLACES)
+    if placement is None:
+        return apply_affine(correction.corrected, edge)
+    return apply_affine(correction.original, placement.forward(edge))
 
 
 def _pixel_size(transform: Affine) -> tuple[float, float]:
@@ -226,7 +232,7 @@ def _target_grid(
     return grid
 
 
-def _warp(
+def warp_pixels(
     source: Path,
     out: Path,
     content: Provenance,
@@ -235,6 +241,7 @@ def _warp(
     options: WriteOptions,
     placement: PixelMap | None,
 ) -> list[str]:
+    """Write a GeoTIFF of a raster on a grid, where it really lies, and return warnings."""
     import rasterio
 
     notes: list[str] = []

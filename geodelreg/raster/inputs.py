@@ -17,6 +17,7 @@ from geodelreg.errors import (
     MissingGeoreferenceError,
     RasterUnreadableError,
     UnsupportedGeoreferenceError,
+    UsageError,
 )
 from geodelreg.raster.arrays import array_dataset, is_xarray, xarray_dataset
 from geodelreg.raster.opening import dataset_grid, open_dataset
@@ -97,6 +98,19 @@ def as_list(source: AnyRaster | Sequence[AnyRaster]) -> list[AnyRaster]:
     if not isinstance(source, list | tuple) or is_placed_array(source):
         return [cast("AnyRaster", source)]
     return list(source)
+
+
+def rasters_of(source: AnyRaster | Sequence[AnyRaster]) -> list[AnyRaster]:
+    """As `as_list`, of rasters that are needed.
+
+    Raises
+    ------
+    UsageError, TypeError
+    """
+    rasters = as_list(source)
+    if not rasters:
+        raise UsageError("no raster was named", "Give at least one.")
+    return rasters
 
 
 def is_placed_array(source: object) -> bool:

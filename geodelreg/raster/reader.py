@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geodelreg.door.names import LOCAL
-from geodelreg.errors import BandGridError, BandNumberError, UsageError
+from geodelreg.errors import BandGridError, BandNumberError
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.raster.environment import (
     TILES_BYTES,
@@ -23,7 +23,7 @@ from geodelreg.raster.environment import (
     gdal_calls,
     passing_through,
 )
-from geodelreg.raster.inputs import AnyMask, AnyRaster, as_list, opened
+from geodelreg.raster.inputs import AnyMask, AnyRaster, opened, rasters_of
 from geodelreg.raster.raster_file import RasterFile
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
 
@@ -70,8 +70,6 @@ class RasterReader:
         *,
         allow: str = LOCAL,
     ) -> None:
-        if not rasters:
-            raise UsageError("no raster file was named", "Give at least one.")
         self._lock = threading.Lock()
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
@@ -379,7 +377,7 @@ def open_raster(
     TypeError
         If it is no raster at all.
     """
-    return RasterReader(as_list(source), masks, allow=allow)
+    return RasterReader(rasters_of(source), masks, allow=allow)
 
 
 def check_band(reader: RasterReader, number: int) -> None:

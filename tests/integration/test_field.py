@@ -133,6 +133,35 @@ def test_on_its_own_grid_it_is_written_too(followed: Alignment, tmp_path: Path) 
         assert (dataset.read_masks(1) > 0).mean() > 0.9
 
 
+def test_sharpening_resamples_once_through_it(wavy: Made, tmp_path: Path) -> None:
+    """MS where it truly lies, by scipy, times PAN over the mean of its bands; a VRT is refused."""
+    out, pair = tmp_path / "sharp.tif", [str(wavy.ms), str(wavy.pan)]
+    with_equal = ["--weights", "equal", "-r", "bilinear", "--extent", "intersection", "-q"]
+    run = CliRunner().invoke(cli, ["pansharpen", *pair, "-o", str(out), *with_equal])
+    assert run.exit_code == 0, run.output
+    rows, columns = np.mgrid[60:580:3, 60:580:3]
+    at = wavy.source_px(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) - 0.5
+    with rasterio.open(wavy.ms) as dataset:
+        bands = [band.astype(float) for band in dataset.read()]
+    placed = np.stack([ndimage.map_coordinates(b, [at[:, 1], at[:, 0]], order=1) for b in bands])
+    with rasterio.open(out) as dataset, rasterio.open(wavy.pan) as pan:
+        assert dataset.tags()["GEODELREG_MODEL"] == "field"
+        left, top = (round(v) for v in ~pan.transform @ (dataset.transform.c, dataset.transform.f))
+        brightness = pan.read(1)[rows, columns].ravel()
+        got = dataset.read()[:, rows - top, columns - left].reshape(len(bands), -1)
+    expected = placed * brightness / placed.mean(axis=0)
+    assert np.std(got - expected) < 0.02 * np.std(expected)
+
+
+def test_a_lazy_raster_holds_none(wavy: Made, followed: Alignment, tmp_path: Path) -> None:
+    out = tmp_path / "sharp.vrt"
+    with pytest.raises(UsageError, match="no geotransform in it holds the model field"):
+        geodelreg.pansharpen(wavy.ms, wavy.pan, out, alignment=followed)
+    asked = ["pansharpen", "no.tif", "none.tif", "-o", str(out), "--model", "field"]
+    assert isinstance(CliRunner().invoke(cli, asked).exception, UsageError)  # before the work
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("way", [["-o", "out.tif"], ["--in-place"]])
 @pytest.mark.parametrize("asked", [["--model", "field"], ["--on-local", "field"]])
 def test_a_header_is_refused_before_the_work(way: list[str], asked: list[str]) -> None:
