@@ -12,7 +12,8 @@ import numpy as np
 
 from geodelreg.fit.choice import FOLDS, fold_numbers, spatial_blocks
 from geodelreg.fit.estimate import Observations
-from geodelreg.geo.maps.field import FieldMap, Kernel, distances, solve_axis
+from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.kriging import Kernel, distances, solve_axis
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 FEWEST_POINTS = 12

@@ -12,7 +12,8 @@ import numpy as np
 
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import tuned
-from geodelreg.geo.maps.field import FieldMap, Kernel
+from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.values.raster import FloatArray, IntArray
 
 _MOST_JUMPS = 6  # unexplained: ablate

@@ -25,7 +25,8 @@ from geodelreg.errors import (
     UsageError,
 )
 from geodelreg.geo.maps.affine import AffineMap
-from geodelreg.geo.maps.field import FieldMap, Kernel
+from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.product.report import report_json
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import NO_TIE_POINTS

@@ -12,7 +12,8 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from geodelreg.geo.maps.field import FieldMap, Kernel
+from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.geo.maps.projective import ProjectiveMap
 from geodelreg.options import WriteOptions
 from geodelreg.product.warp import write_warped
