@@ -64,6 +64,7 @@ PEERS: tuple[Peer, ...] = (
     Peer("OpenCV SIFT + RANSAC", "opencv_sift", OPENCV, "import cv2"),
     Peer("half-size SIFT", "half_size_sift", OPENCV, "import cv2", settings=("default",)),
     Peer("OpenCV ECC", "opencv_ecc", OPENCV, "import cv2"),
+    Peer("SIFT + MAGSAC, ECC on a band mix", "opencv_expert", OPENCV, "import cv2", ("best",)),
     Peer("phase correlation", "phase_correlation", (("scikit-image", *RASTERS),), "import skimage"),
     Peer("SimpleITK affine MI", "simpleitk", (("SimpleITK", *RASTERS),), "import SimpleITK"),
     Peer("elastix affine", "elastix", (("itk-elastix", *RASTERS),), "import itk"),

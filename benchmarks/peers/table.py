@@ -16,8 +16,9 @@ CAVEATS = """How to read it:
 
 - geodelreg was developed on these very scenes. The peers were not tuned on them: `best` is one
   richer setting each (visible bands, finer grid, more samples, local tie points), written down once
-  and not searched for; it can be worse than `default`, and an expert would do better. Other scripts
-  around some of the same tools have got 0.02 to 0.05 px on comparable scenes (shift, 4:1).
+  and not searched for; it can be worse than `default`, and an expert would do better: see the next
+  section. Other scripts around some of the same tools have got 0.02 to 0.05 px on comparable scenes
+  (shift, 4:1).
 - Phase correlation and global AROSICS estimate a shift only; most peers are made for headers that
   are a few pixels off and nearly unrotated, so C is outside what they promise.
 - An affine through AROSICS's, pandora2d's and Orfeo ToolBox's points is the adapter's, not theirs.

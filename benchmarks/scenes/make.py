@@ -1,4 +1,4 @@
-"""Scenes A to J and aerial: an MS and a PAN raster each, from real imagery, with known truth."""
+"""Scenes A to M and aerial: an MS and a PAN raster each, from real imagery, with known truth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -84,6 +85,12 @@ class SceneSpec:
         CRS of MS where it is not PAN's.
     pan_weights : tuple of 4 float
         Of the blue, green, red and near infrared radiance in PAN.
+    ms_bands : tuple of int
+        Of these four, what MS sees, from 0.
+    blur_ms_px : float
+        Standard deviation of the optics of MS beyond its square pixel.
+    jpeg_quality : int or None
+        MS has 8 bits and is compressed with loss.
     """
 
     name: str
@@ -97,6 +104,9 @@ class SceneSpec:
     variant: str = ""
     ms_epsg: int | None = None
     pan_weights: tuple[float, ...] = PAN_WEIGHTS
+    ms_bands: tuple[int, ...] = (0, 1, 2, 3)
+    blur_ms_px: float = BLUR_MS_PX
+    jpeg_quality: int | None = None
 
 
 SCENES: tuple[SceneSpec, ...] = (
@@ -135,6 +145,20 @@ SCENES: tuple[SceneSpec, ...] = (
         variant="large",
     ),
     SceneSpec(
+        "K",
+        "PAN holds infrared that no MS band saw",
+        HeaderError((-5.21, 4.38)),
+        pan_weights=(0.05, 0.3, 0.3, 0.35),
+        ms_bands=(0, 1, 2),
+    ),
+    SceneSpec(
+        "L",
+        "MS of 8 bits, JPEG quality 75",
+        HeaderError((4.13, 6.27), (1.0004, 0.0, 0.0, 0.9997)),
+        jpeg_quality=75,
+    ),
+    SceneSpec("M", "soft optics of MS", HeaderError((-2.43, -6.17)), blur_ms_px=0.7),
+    SceneSpec(
         "aerial",
         "aerial texture",
         HeaderError.similarity(0.4, 1.0, (2.63, -3.41)),
@@ -151,16 +175,19 @@ class Scene:
 
     Attributes
     ----------
-    ms : (4, h, w) uint16
+    ms : (B, h, w) uint16
     pan : (H, W) uint16
     truth : Truth
     nodata : int or None
+    jpeg_quality : int or None
+        MS is written in 8 bits and with such a loss; None = as it is.
     """
 
     ms: NDArray[np.uint16]
     pan: NDArray[np.uint16]
     truth: Truth
     nodata: int | None = None
+    jpeg_quality: int | None = None
 
 
 def make_scene(
@@ -191,10 +218,16 @@ def make_scene(
     if bend is not None:
         in_pan = placement.centres_px - ground.offset
         placement = replace(placement, centres_px=placement.centres_px + bend(in_pan))
-    ms = _expose_ms(ms_ground, placement, rng, band_shifts)
+    ms = _expose_ms(ms_ground, placement, rng, band_shifts, spec.blur_ms_px)[list(spec.ms_bands)]
     if nodata is not None:
         _cut_wedges(ms, pan)
-    return Scene(ms, pan, truth, nodata)
+    return Scene(ms, pan, truth, nodata, spec.jpeg_quality)
+
+
+def to_uint8(bands: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Each band between its 0.5th and 99.5th percentile."""
+    low, high = np.percentile(bands, [0.5, 99.5], axis=(1, 2), keepdims=True)
+    return np.asarray(np.clip(np.round((bands - low) / (high - low) * 255), 0, 255), np.uint8)
 
 
 def lay_out(spec: SceneSpec, imagery: Imagery) -> tuple[Truth, Ground, Placement]:
@@ -316,12 +349,13 @@ def _expose_ms(
     ground: Ground,
     placement: Placement,
     rng: np.random.Generator,
-    band_shifts: tuple[tuple[float, float], ...] = (),
+    band_shifts: tuple[tuple[float, float], ...],
+    blur_ms_px: float,
 ) -> NDArray[np.uint16]:
     shifts = band_shifts or ((0.0, 0.0),) * len(ground.bands)
     places = [replace(placement, centres_px=placement.centres_px + shift) for shift in shifts]
     bands = [
-        digitise(tone(render(band, place, BLUR_MS_PX), gamma, gain), rng)
+        digitise(tone(render(band, place, blur_ms_px), gamma, gain), rng)
         for band, place, gamma, gain in zip(
             ground.bands, places, BAND_GAMMAS, BAND_GAINS, strict=True
         )
@@ -342,7 +376,9 @@ def write_scene(scene: Scene, folder: Path) -> None:
     """Write ``ms.tif``, ``pan.tif`` (tiled, deflate) and ``truth.json`` into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     truth = scene.truth
-    write_raster(folder / "ms.tif", scene.ms, truth.ms_header, truth.ms_crs, scene.nodata)
+    quality = scene.jpeg_quality
+    ms = scene.ms if quality is None else to_uint8(scene.ms)
+    write_raster(folder / "ms.tif", ms, truth.ms_header, truth.ms_crs, scene.nodata, quality)
     write_raster(folder / "pan.tif", scene.pan[None], truth.pan, truth.pan_crs, scene.nodata)
     truth.save(folder / "truth.json")
 
@@ -353,8 +389,9 @@ def write_raster(
     transform: tuple[float, ...],
     crs_wkt: str,
     nodata: int | None = None,
+    jpeg_quality: int | None = None,
 ) -> None:
-    """Write a tiled, deflated GeoTIFF.
+    """Write a tiled GeoTIFF, deflated or with JPEG.
 
     Parameters
     ----------
@@ -363,8 +400,13 @@ def write_raster(
     transform : tuple of 6 float
     crs_wkt : str
     nodata : int or None
+    jpeg_quality : int or None
     """
     import rasterio
+
+    packed: dict[str, Any] = {"compress": "deflate", "predictor": 2}
+    if jpeg_quality is not None:
+        packed = {"compress": "jpeg", "jpeg_quality": jpeg_quality, "photometric": "minisblack"}
 
     with rasterio.open(
         path,
@@ -380,8 +422,7 @@ def write_raster(
         tiled=True,
         blockxsize=256,
         blockysize=256,
-        compress="deflate",
-        predictor=2,
+        **packed,
     ) as raster:
         raster.write(data)
 

@@ -14,6 +14,8 @@ from geodelreg.values.raster import FloatArray
 
 MARGIN = 2  # nodes around the grid, where a spline has no end to be unsure of
 COARSEST_PX, FINEST_PX = 64, 2
+"""Steps between nodes: from where a field is asked for a few thousand places to where every other
+pixel is, which no spline needs to do better."""
 
 Values = Callable[[FloatArray, FloatArray], FloatArray]
 """(R, C, 2) places at (R,) rows and (C,) columns of a grid, outer corner."""
