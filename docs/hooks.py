@@ -14,7 +14,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "cli")]
 from docs.commands import cli_page  # noqa: E402
 from docs.report_fields import report_page  # noqa: E402
 
-AT_HOME = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+AT_HOME = {
+    "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
+}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

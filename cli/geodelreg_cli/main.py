@@ -32,6 +32,7 @@ COMMANDS = {
     "apply": ("geodelreg_cli.apply", "Apply a correction to other files of the scene."),
     "batch": ("geodelreg_cli.batch", "Align or check many pairs, with a ledger; also on Dask."),
     "check": ("geodelreg_cli.check", "Tell whether MS lies where PAN says; write nothing."),
+    "completion": ("geodelreg_cli.completion", "Make the shell complete commands and options."),
     "figure": ("geodelreg_cli.figure", "Draw what a JSON report tells: before and after, arrows."),
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
     "info": ("geodelreg_cli.info", "Tell grid, CRS, footprint, bands and provenance of rasters."),

@@ -30,6 +30,7 @@ def modules_after(statement: str) -> set[str]:
         ["align", "--help"],
         ["batch", "--help"],
         ["check", "--help"],
+        ["completion", "bash"],
         ["gcps", "--help"],
         ["revert", "-h"],
     ],

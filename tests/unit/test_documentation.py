@@ -9,7 +9,9 @@ from pathlib import Path
 
 import click
 import pytest
+import yaml
 
+import geodelreg
 from geodelreg import errors
 from geodelreg.flags import flags
 from geodelreg.judge.verdict import Evidence, judge
@@ -79,6 +81,28 @@ def test_links_outside_of_the_site_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     missing = [x for x in links if "://" not in x and not (page.parent / x).exists()]
     assert missing == []
+
+
+def test_citation_names_this_version_and_the_paper() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (citation["version"], citation["license"]) == (geodelreg.__version__, "MIT")
+    (paper,) = citation["references"]
+    names = [f"{author['given-names']} {author['family-names']}" for author in paper["authors"]]
+    page = " ".join((ROOT / "docs" / "method.md").read_text(encoding="utf-8").split())
+    assert f"{', '.join(names)}, *{paper['title']}*, {paper['journal']}" in page
+    numbers = "{volume}({issue}), {year}, {start}–{end}".format_map(paper)
+    assert numbers in page
+
+
+@pytest.mark.parametrize(
+    "template",
+    sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml")),
+    ids=lambda p: p.name,
+)
+def test_issues_ask_for_the_report(template: Path) -> None:
+    form = yaml.safe_load(template.read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= form.keys()
+    assert "report" in [part.get("id") for part in form["body"]]
 
 
 def test_the_gates_limits_are_those_in_the_method_page() -> None:

@@ -1,4 +1,4 @@
-"""What is installed: two packages, their data, two entry points, and nothing else."""
+"""What is installed: two packages, their data, manual pages, entry points, and nothing else."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import tarfile
 import zipfile
 from pathlib import Path
 
+import click
 import pytest
 
 import geodelreg
+from geodelreg_cli.main import COMMANDS, cli
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,6 +41,7 @@ def test_wheel_installs_two_packages_and_no_package_called_cli(wheel: zipfile.Zi
         "geodelreg",
         "geodelreg_cli",
         f"geodelreg-{geodelreg.__version__}.dist-info",
+        f"geodelreg-{geodelreg.__version__}.data",
     }
 
 
@@ -50,7 +53,38 @@ def test_wheel_holds_every_module_and_data_file_of_the_library(wheel: zipfile.Zi
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert {"geodelreg/py.typed", "geodelreg_cli/main.py"} <= expected
-    assert expected == {name for name in wheel.namelist() if ".dist-info/" not in name}
+    parts = (".dist-info/", ".data/")
+    assert expected == {
+        name for name in wheel.namelist() if not any(part in name for part in parts)
+    }
+
+
+def test_wheel_holds_a_manual_page_of_every_command_with_its_options(
+    wheel: zipfile.ZipFile,
+) -> None:
+    folder = f"geodelreg-{geodelreg.__version__}.data/data/share/man/man1/"
+    context = click.Context(cli, info_name="geodelreg")
+    pages = {"geodelreg": cli} | {
+        f"geodelreg-{name}": cli.get_command(context, name) for name in COMMANDS
+    }
+    assert {name for name in wheel.namelist() if ".data/" in name} == {
+        f"{folder}{page}.1" for page in pages
+    }
+    for page, command in pages.items():
+        text = wheel.read(f"{folder}{page}.1").decode().replace("\\-", "-")
+        assert command is not None
+        assert f".SH NAME\n{page} - " in text
+        for param in command.params:
+            for flag in param.opts if isinstance(param, click.Option) else ():
+                assert flag in text
+
+
+def test_an_index_would_take_the_distributions(distributions: Path) -> None:
+    command = [sys.executable, "-m", "twine", "check", "--strict"]
+    checked = subprocess.run(
+        [*command, *map(str, distributions.iterdir())], capture_output=True, text=True
+    )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
 def test_wheel_names_version_and_entry_points(wheel: zipfile.ZipFile) -> None:
@@ -70,7 +104,14 @@ def test_source_archive_can_build_and_test_itself(distributions: Path) -> None:
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "README.md", "LICENSE", "tests/unit/test_packaging.py"} <= names
-    assert not any(name.startswith((".ci/", "benchmarks/.cache/")) for name in names)
+    assert {
+        "hatch_build.py",
+        "mkdocs.yml",
+        "docs/commands.py",
+        "CITATION.cff",
+        "Dockerfile",
+    } <= names
+    assert not any(name.startswith((".ci/", "benchmarks/.cache/", "site/")) for name in names)
 
 
 def test_public_names_are_all_there() -> None:

@@ -1,0 +1,26 @@
+"""Adds the manual pages, which are made from the commands, to the wheel."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+
+class ManualPages(BuildHookInterface[Any]):
+    """Puts a page a command where ``man`` looks below an installation's prefix."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Make the pages before the wheel is packed."""
+        sys.path[:0] = [self.root, str(Path(self.root, "cli"))]
+        from docs.commands import man_pages
+
+        folder = Path(tempfile.mkdtemp())
+        for name, text in man_pages().items():
+            folder.joinpath(name).write_text(text, encoding="utf-8")
+            build_data["shared_data"][str(folder / name)] = f"share/man/man1/{name}"
