@@ -54,19 +54,6 @@ def test_every_knob_is_a_flag_of_align() -> None:
         assert set(flags(knob)) <= offered
 
 
-def test_readme_lists_every_flag_of_align_and_no_other() -> None:
-    command = cli.get_command(click.Context(cli), "align")
-    assert command is not None
-    offered = {
-        max(param.opts, key=len) for param in command.params if isinstance(param, click.Option)
-    }
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    table = readme.partition("## Options")[2].partition("\n## ")[0]
-    rows = [line for line in table.splitlines() if line.startswith("| `")]
-    listed = {flag for row in rows for flag in re.findall(r"`[^`]*?(--[a-z-]+)", row.split("|")[1])}
-    assert listed == offered
-
-
 def test_every_command_is_explained_in_a_how_to() -> None:
     folders = [ROOT / "docs" / folder for folder in ("how-to", "tutorials")]
     pages = [page for folder in folders for page in folder.glob("*.md")]
@@ -103,6 +90,17 @@ def test_issues_ask_for_the_report(template: Path) -> None:
     form = yaml.safe_load(template.read_text(encoding="utf-8"))
     assert {"name", "description", "body"} <= form.keys()
     assert "report" in [part.get("id") for part in form["body"]]
+
+
+def test_every_reason_of_the_gate_has_an_entry() -> None:
+    unknown = dict.fromkeys((field.name for field in fields(Evidence)), float("nan"))
+    options = AlignOptions(max_shift_px=1, max_rotation_deg=1, max_scale=2)
+    reasons = {reason.name for reason in judge(Evidence(**unknown), options)}
+    page = (ROOT / "docs" / "refusals.md").read_text(encoding="utf-8")
+    entries = re.findall(r"^### ([^\n]*)\n\n(.*?)(?=^#)", page, re.M | re.S)
+    explained = {name for heading, _ in entries for name in re.findall(r"`(\w+)`", heading)}
+    assert explained == reasons | {"field_points"}
+    assert all("**What helps.**" in text for _, text in entries)
 
 
 def test_the_gates_limits_are_those_in_the_method_page() -> None:
