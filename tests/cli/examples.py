@@ -1,7 +1,8 @@
 """Runs the examples of a page of the documentation as they stand there.
 
 Blocks that are marked ``sh`` or ``python`` are examples. What needs more than a test has (a
-network, a cluster, other programs) is marked ``bash`` or ``py``, and what is printed ``text``.
+network, a cluster, other programs) is marked ``bash`` or ``py``.  A block ``text`` right after one
+for the shell is what that prints; numbers may differ.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ def pages() -> list[str]:
     return [page.relative_to(ROOT).as_posix() for page in found]
 
 
-def examples(page: str) -> list[tuple[str, str]]:
-    """Language and text of each example, in order."""
+def examples(page: str, languages: str = "sh|python") -> list[tuple[str, str, str]]:
+    """Language and text of each example, and what the page says that it prints, in order."""
     text = (ROOT / page).read_text(encoding="utf-8")
-    return re.findall(r"^```(sh|python)\n(.*?)^```", text, re.M | re.S)
+    block = rf"^```({languages})\n(.*?)^```\n(?:\n```text\n(.*?)^```)?"
+    return re.findall(block, text, re.M | re.S)
 
 
-def run_examples(page: str, folder: Path, port: int) -> None:
+def run_examples(page: str, folder: Path, port: int, languages: str = "sh|python") -> None:
     """Run all examples of a page, one after the other.
 
     Those in Python share one namespace, as in a session.
@@ -49,6 +51,8 @@ def run_examples(page: str, folder: Path, port: int) -> None:
         Where they run, with the files that they name.
     port : int
         Of a cluster, in place of Dask's usual one.
+    languages : str
+        Those of the blocks, ``|`` between them.
 
     Raises
     ------
@@ -56,7 +60,7 @@ def run_examples(page: str, folder: Path, port: int) -> None:
         When one fails.
     """
     session: dict[str, Any] = {"__name__": "__main__"}
-    for language, text in examples(page):
+    for language, text, told in examples(page, languages):
         block = text.replace("8786", str(port))
         if language == "python":
             with contextlib.chdir(folder):
@@ -66,4 +70,12 @@ def run_examples(page: str, folder: Path, port: int) -> None:
             ["bash", "-m", "-c", PRELUDE + block], cwd=folder, capture_output=True, text=True,
             timeout=300, env=os.environ | {"COLUMNS": "100"},
         )  # fmt: skip
-        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
+        printed = done.stdout + done.stderr
+        assert done.returncode == 0, f"{block}\n{printed}"
+        lines = [_without_numbers(line) for line in printed.splitlines()]
+        missing = [x for x in told.splitlines() if _without_numbers(x) not in lines]
+        assert missing == [], printed
+
+
+def _without_numbers(line: str) -> str:
+    return re.sub(r"[0-9.]+", "0", line)

@@ -220,6 +220,7 @@ PAGES: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "docs/how-to/apply.md": (scene_of_several_files, nothing),
     "docs/how-to/band-files.md": (band_files, bands_are_aligned),
     "docs/how-to/bent.md": (corner, spline_is_aligned),
+    "docs/how-to/check.md": (whole, nothing),
     "docs/how-to/clouds.md": (clouds, nothing),
     "docs/how-to/in-place.md": (corner, header_is_back),
     "docs/how-to/no-data.md": (framed, frame_is_no_data),
