@@ -92,15 +92,19 @@ def test_issues_ask_for_the_report(template: Path) -> None:
     assert "report" in [part.get("id") for part in form["body"]]
 
 
-def test_every_reason_of_the_gate_has_an_entry() -> None:
+def test_every_reason_of_the_gate_has_an_entry_that_begins_with_its_message() -> None:
     unknown = dict.fromkeys((field.name for field in fields(Evidence)), float("nan"))
-    options = AlignOptions(max_shift_px=1, max_rotation_deg=1, max_scale=2)
-    reasons = {reason.name for reason in judge(Evidence(**unknown), options)}
+    options = AlignOptions(max_shift_px=50, max_rotation_deg=1, max_scale=2)
+    messages = {reason.name: reason.message for reason in judge(Evidence(**unknown), options)}
     page = (ROOT / "docs" / "refusals.md").read_text(encoding="utf-8")
-    entries = re.findall(r"^### ([^\n]*)\n\n(.*?)(?=^#)", page, re.M | re.S)
-    explained = {name for heading, _ in entries for name in re.findall(r"`(\w+)`", heading)}
-    assert explained == reasons | {"field_points"}
-    assert all("**What helps.**" in text for _, text in entries)
+    entries = re.findall(r"^### ([^\n]*)\n\n> ([^\n]*)\n(.*?)(?=^#)", page, re.M | re.S)
+    explained = {name: said for heading, said, _ in entries for name in re.findall(r"\w+", heading)}
+    assert set(explained) == {*messages, "field_points"}
+    for name, message in messages.items():
+        if name not in ("max_rotation", "max_scale"):  # share an entry with max_shift
+            words = explained[name].partition(" ")[2].split("…")
+            assert all(part in message for part in words), message
+    assert all("**What helps.**" in text for _, _, text in entries)
 
 
 def test_the_gates_limits_are_those_in_the_method_page() -> None:
