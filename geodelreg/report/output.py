@@ -5,6 +5,7 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
+from geodelreg.errors import UsageError
 from geodelreg.geotiff.atomic import write_text_atomically
 from geodelreg.geotiff.targets import STDOUT
 from geodelreg.product.report import report_json
@@ -36,6 +37,8 @@ def report_text(alignment: Alignment, path: Path) -> str:
     Raises
     ------
     MissingExtraError
+    UsageError
+        A page of rasters that are in no file.
     GeodelregError
         Its other kinds, when a page's rasters cannot be read again.
     """
@@ -43,6 +46,13 @@ def report_text(alignment: Alignment, path: Path) -> str:
     if not is_page(path):
         listed = path != STDOUT and len(alignment.tie_points) > 0
         return report_json(alignment, tie_points=listed) + "\n"
+    for raster, name in ((alignment.source, "MS"), (alignment.reference, "PAN")):
+        if raster.in_memory:
+            raise UsageError(
+                f"A page reads the rasters again, and {name} is no file",
+                "Write the report as JSON; of the same in files `geodelreg report REPORT.json MS "
+                f"PAN -o {path.name}` makes the page.",
+            )
     from geodelreg.report.page import page
 
     return page(alignment)
@@ -62,6 +72,6 @@ def write_report(alignment: Alignment, path: str | PathLike[str], overwrite: boo
 
     Raises
     ------
-    MissingExtraError, OutputExistsError, OutputUnwritableError, FileLockedError
+    MissingExtraError, UsageError, OutputExistsError, OutputUnwritableError, FileLockedError
     """
     write_text_atomically(Path(path), report_text(alignment, Path(path)), overwrite)

@@ -313,6 +313,16 @@ def test_what_has_no_file_is_not_written(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["points.geojson"]
 
 
+def test_a_page_of_arrays_is_refused_with_the_way_to_one(tmp_path: Path) -> None:
+    ms, pan = (rioxarray.open_rasterio(path) for path in (MS, PAN))
+    alignment = geodelreg.align(ms, pan)
+    with pytest.raises(UsageError, match="no file") as told:
+        geodelreg.write_report(alignment, tmp_path / "page.html")
+    assert "geodelreg report" in told.value.remedy
+    geodelreg.write_report(alignment, tmp_path / "report.json")
+    assert {path.name for path in tmp_path.iterdir()} == {"report.json"}
+
+
 def test_apply_refuses_what_it_cannot_place(of_files: geodelreg.Alignment) -> None:
     with pytest.raises(TypeError, match=r"correction\.apply"):
         of_files.apply(np.zeros((3, 3)))  # type: ignore[type-var]
