@@ -216,7 +216,7 @@ def nothing(folder: Path) -> None:
 PAGES: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "docs/api.md": (python_files, output_is_aligned),
     "docs/batch.md": (many_pairs, pairs_are_aligned),
-    "docs/start.md": (whole, output_is_aligned),
+    "docs/start.md": (corner, output_is_aligned),
     "docs/how-to/apply.md": (scene_of_several_files, nothing),
     "docs/how-to/band-files.md": (band_files, bands_are_aligned),
     "docs/how-to/bent.md": (corner, spline_is_aligned),
