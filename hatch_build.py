@@ -20,7 +20,12 @@ class ManualPages(BuildHookInterface[Any]):
         sys.path[:0] = [self.root, str(Path(self.root, "cli"))]
         from docs.commands import man_pages
 
-        folder = Path(tempfile.mkdtemp())
+        self.folder = tempfile.TemporaryDirectory()
         for name, text in man_pages().items():
-            folder.joinpath(name).write_text(text, encoding="utf-8")
-            build_data["shared_data"][str(folder / name)] = f"share/man/man1/{name}"
+            path = Path(self.folder.name, name)
+            path.write_text(text, encoding="utf-8")
+            build_data["shared_data"][str(path)] = f"share/man/man1/{name}"
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Take away what was packed."""
+        self.folder.cleanup()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import email
+import os
 import subprocess
 import sys
 import tarfile
@@ -22,10 +23,14 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(scope="module")
 def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with a freshly built wheel and source archive."""
-    target = tmp_path_factory.mktemp("dist")
+    target, scratch = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("scratch")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(target), str(ROOT)]
-    built = subprocess.run([*command, "--wheel", "--sdist"], capture_output=True, text=True)
+    built = subprocess.run(
+        [*command, "--wheel", "--sdist"], capture_output=True, text=True,
+        env=os.environ | {"TMPDIR": str(scratch)},
+    )  # fmt: skip
     assert built.returncode == 0, built.stdout + built.stderr
+    assert list(scratch.iterdir()) == []
     return target
 
 
