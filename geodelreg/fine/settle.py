@@ -29,6 +29,7 @@ from geodelreg.values.raster import FloatArray, IntArray, StatusArray
 _MOST_PASSES = 4  # unexplained: ablate
 _TUNED_PASSES = 2  # then tone and point spread are known
 _STANDS_STILL = 0.2  # of its standard error; unexplained: ablate
+_TONE_TILES = 120  # of a hundred samples each: weights of bands are then known to a percent
 _STEEP = 4.0
 """Patches within which the residual varies, below which smaller ones are tried."""
 _NOISY = 2.0
@@ -126,9 +127,10 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
     kernel = start.kernel if isinstance(start, FieldMap) else None
     jumps: tuple[float, ...] = ()
     options = MatchOptions(size, _ITERATIONS, _TOLERANCE, bent=True)
+    some_tiles = tiles[:: 1 + len(tiles) // _TONE_TILES]
     for number in range(1, _MOST_PASSES + 1):
         if number <= _TUNED_PASSES:
-            tone = fit_tone(part, tiles, current, tuning.sigma)
+            tone = fit_tone(part, some_tiles, current, tuning.sigma)
             tuning = replace(tuning, tone=tone)
         if settled is not None and number <= _TUNED_PASSES and not tuning.local_tone:
             agreed = settled.matched.template_px[settled.ground[settled.fit.inlier]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -30,8 +29,12 @@ def rigid_core(points: Observations, unit: float) -> BoolArray:
     """
     variance = points.covariance[:, 0, 0] + points.covariance[:, 1, 1]
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance))), _CORE_FLOOR_PX * unit)
+    move = points.target - points.source
+    apart = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1))
     while tolerance <= unit:
-        residuals = list(_rigid_residuals(points, variance, tolerance))
+        near = apart <= tolerance
+        shift = move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
+        residuals = [move - shift, *_affine_residuals(points, variance, tolerance)]
         shares = [float((np.hypot(*gap.T) <= tolerance).mean()) for gap in residuals]
         if shares[0] >= max(_SHIFT_SHARE, shares[-1] / 2):
             return _core(residuals[0], tolerance, variance)
@@ -51,15 +54,11 @@ def _core(residual: FloatArray, tolerance: float, variance: FloatArray) -> BoolA
     return np.asarray(radius**2 < (_CORE_REACH * tolerance) ** 2 + 4.0 * variance)
 
 
-def _rigid_residuals(
+def _affine_residuals(
     points: Observations, variance: FloatArray, tolerance: float
-) -> Iterator[FloatArray]:
-    """(N, 2) residuals of the best shift of the header, then of the best affine."""
-    move = points.target - points.source
-    near = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1)) <= tolerance
-    yield move - move[near[int(near.sum(axis=1).argmax())]].mean(axis=0)
+) -> list[FloatArray]:
+    """(N, 2) residuals of the best affine; none where there is none."""
     found = consensus_affine(
         points.source, points.target, variance, tolerance, least_share=_SOUGHT_SHARE
     )
-    if found.map is not None:
-        yield points.target - found.map.forward(points.source)
+    return [] if found.map is None else [points.target - found.map.forward(points.source)]

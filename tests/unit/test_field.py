@@ -14,6 +14,7 @@ from geodelreg.fit.jumps import find_jumps
 from geodelreg.fit.residual import residual_of, shared_by_neighbours
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.spline import interpolated
 
 Array = NDArray[np.float64]
 SIDE = 440.0
@@ -208,3 +209,17 @@ def test_neighbours_share_what_bends_and_not_their_noise() -> None:
 
 def test_a_handful_of_neighbours_tells_nothing() -> None:
     assert np.isnan(shared_by_neighbours(lattice()[:10], np.zeros((10, 2))).high_px)
+
+
+@pytest.mark.parametrize("jumps", [(), (233.0,)])
+def test_a_spline_through_some_places_of_a_field_is_the_field(jumps: tuple[float, ...]) -> None:
+    """Also where it jumps: there the field itself is asked."""
+    xy = lattice()
+    points = observe(wave(0.35, 150.0, xy) + step(xy), xy, np.random.default_rng(11))
+    fit, axis = fit_field(points, jumps=jumps).field, np.arange(0.5, SIDE)
+
+    def asked(y: Array, x: Array) -> Array:
+        return fit.forward(np.stack(np.meshgrid(x, y), axis=-1))
+
+    values, _ = interpolated(asked, (int(SIDE), int(SIDE)), 1e-3)
+    assert np.abs(values(axis, axis) - asked(axis, axis)).max() < 1e-3
