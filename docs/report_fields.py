@@ -107,7 +107,7 @@ def _resolved(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
 
 def _python(path: str) -> str:
     """Name of the same value in Python; empty where there is none."""
-    if path in NO_NAME or path.startswith("tie_points.by_status"):
+    if path in NO_NAME or path.startswith(("tie_points.by_status", "bands[]")):
         return ""
     if path in OTHER_NAMES:
         return OTHER_NAMES[path]

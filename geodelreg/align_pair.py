@@ -20,6 +20,7 @@ from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.least_squares import Matched
 from geodelreg.fine.matching import patches_log_nfa, tie_points
 from geodelreg.fine.passes import Refinement, refine, refine_proven
+from geodelreg.fine.per_band import match_each_band
 from geodelreg.fine.settle import settle
 from geodelreg.fit.choice import Fitted, HeldOut, Selection, half_disagreement, select_model
 from geodelreg.fit.estimate import Estimate
@@ -36,12 +37,13 @@ from geodelreg.judge.verdict import (
     verdict,
 )
 from geodelreg.judge.whole import Whole, look_at_whole
-from geodelreg.judge.words import bands_warning, warnings_of
+from geodelreg.judge.words import bands_warning, unheard_bands, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status, TiePoints
 from geodelreg.values.raster import StatusArray, WindowReader
-from geodelreg.values.result import Accuracy, Solution
+from geodelreg.values.result import Accuracy, BandMap, Solution
 from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
@@ -263,11 +265,14 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
             accuracy, evidence = whole.added_to(accuracy, evidence)
             notes = whole.warnings(options)
         notes += bands_warning(evidence)
-        spots = pair.source_lattice(LATTICE)
-        move_px = np.hypot(*pair.move_px(fitted.map, spots).T)
-        sigma_px = fitted.map.sigma_at(spots) * pair.pan_px_per_source_px
-        moves = is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
     model, reasons = fitted.selection.estimate.model, judge(evidence, options)
+    bands: tuple[BandMap, ...] = ()
+    if options.per_band and passes(reasons):
+        with pair.timings("bands"):
+            if refined.part.ms_is_template:
+                bands = match_each_band(refined, fitted.map, model, options.band_model)
+        notes += unheard_bands(pair, bands)
+    moves = any(_moves(pair, one) for one in (fitted.map, *(band.map for band in bands)))
     if options.model == "field" and model != "field" and passes(reasons):
         reasons = (*reasons, too_few_for_a_field(accuracy.kept))
     names = [pair.source.band_names[band - 1] for band in pair.source_bands]
@@ -281,7 +286,16 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
         search=guess.search,
+        bands=bands,
     )
+
+
+def _moves(pair: Pair, correction: PixelMap) -> bool:
+    """True of a correction that is worth to be applied."""
+    spots = pair.source_lattice(LATTICE)
+    move_px = np.hypot(*pair.move_px(correction, spots).T)
+    sigma_px = correction.sigma_at(spots) * pair.pan_px_per_source_px
+    return is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
 
 
 def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:

@@ -68,6 +68,11 @@ class Alignment(result.Alignment):
         """Of the solution."""
         return self.solution.band_weights
 
+    @property
+    def bands(self) -> tuple[result.BandMap, ...]:
+        """Of the solution."""
+        return self.solution.bands
+
     def summary(self) -> str:
         """A few lines for people: what was found, how good it is, what to do next."""
         return summary_text(self)

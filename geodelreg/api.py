@@ -167,7 +167,6 @@ def check(
     options: AlignOptions | None = None,
     *,
     limit_px: float = 0.5,
-    per_band: bool = False,
     mask: AnyMask | Sequence[AnyMask] | None = None,
     pan_mask: AnyMask | Sequence[AnyMask] | None = None,
     progress: Progress | None = None,
@@ -183,11 +182,9 @@ def check(
         The PAN raster.
     options : AlignOptions, optional
         Its `tolerance_px`, `max_residual_px` and `on_local` have no meaning here: whatever is found
-        is measured, and `limit_px` judges it.
+        is measured, and `limit_px` judges it.  With `per_band` each band is also matched by itself.
     limit_px : float
         Largest misalignment, anywhere in the overlap, that counts as aligned, PAN pixels.
-    per_band : bool
-        Also match each band by itself.
     mask, pan_mask : mask or sequence of masks, optional
         As for `align`.
     progress : callable, optional
@@ -212,7 +209,10 @@ def check(
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"`limit_px={limit_px}` is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
-    options = replace(options, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn")
+    per_band = options.per_band
+    options = replace(
+        options, per_band=False, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn"
+    )
     with _open(source, reference, options, masks, pan_masks) as rasters:
         count = len(rasters.ms.band_names) if per_band else 0
         report = part_of(progress, 0, count + 1)

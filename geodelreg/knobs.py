@@ -13,6 +13,8 @@ class AlignKnobs(TypedDict, total=False):
     model: str
     north_up: bool
     band: int | None
+    per_band: bool
+    band_model: str
     pan_band: int
     masks: tuple[str, ...]
     pan_masks: tuple[str, ...]

@@ -102,6 +102,16 @@ class AlignOptions:
         None,
         "MS band to match on, from 1; auto weights the bands so that together they look like PAN.",
     )
+    per_band: bool = _knob(
+        False,
+        "Correct each MS band by itself: one common map, and on top of it where each band lies. "
+        "OUT is then a folder with one file per band, a .vrt, or resampled (`warp`).",
+    )
+    band_model: str = _knob(
+        "shift",
+        "How a band may lie to the common map, with `per_band`.",
+        ("shift", "affine"),
+    )
     pan_band: int = _knob(1, "Band of the PAN (reference) raster to match on, from 1.")
     masks: tuple[str, ...] = _knob(
         (),
@@ -182,7 +192,13 @@ class AlignOptions:
         _check_choice(self, "model")
         _check_choice(self, "search")
         _check_choice(self, "allow")
+        _check_choice(self, "band_model")
         _check_range(self, "band", 1, 65535)
+        if self.per_band and (self.band or self.method != "delaunay"):
+            raise UsageError(
+                "`per_band=True` matches each band, by `method='delaunay'`",
+                "Drop `band`, and use that method.",
+            )
         _check_range(self, "pan_band", 1, 65535)
         _check_masks(self, "masks")
         _check_masks(self, "pan_masks")

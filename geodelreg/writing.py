@@ -68,13 +68,17 @@ def write(
     check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
     check_is_file(alignment)
+    if alignment.options.per_band and not options.warp:
+        from geodelreg.writing_bands import write_bands
+
+        return write_bands(alignment, Path(target), options)
     if not (options.warp or options.georef == "gcps"):
         _check_header_holds(alignment)
     tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
     notes: list[str] = []
     with (
         _targets(alignment, Path(target)) as pairs,
-        together([out for _, out in pairs], lambda: _inputs(alignment)),
+        together([out for _, out in pairs], lambda: inputs_of(alignment)),
     ):
         for path, out in pairs:
             check_replaceable(out, options.overwrite, stale_beside(out, path))
@@ -90,6 +94,7 @@ def write(
                     options,
                     pan,
                     placement_of(alignment, correction),
+                    placed_bands(alignment, path, correction),
                 )
             else:
                 placement = placement_of(alignment, correction)
@@ -117,7 +122,7 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.geotiff.inplace import edit_in_place
 
     check_accepted(alignment)
-    _check_header_holds(alignment)
+    _check_one_header(alignment)
     check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
@@ -135,6 +140,15 @@ def _gcps_of_map(path: Path, placement: PixelMap, allow: str) -> tuple[Gcp, ...]
 
     with open_raster(path, allow=allow) as reader:
         return gcps_of_map(str(path), placement, reader.grid)
+
+
+def _check_one_header(alignment: Alignment) -> None:
+    if alignment.options.per_band:
+        raise UsageError(
+            "`per_band=True` finds a place for each band, and a header has one for all",
+            "Write to a folder, one file per band, to a .vrt, or resample (`warp=True`).",
+        )
+    _check_header_holds(alignment)
 
 
 def _check_header_holds(alignment: Alignment) -> None:
@@ -160,6 +174,39 @@ def placement_of(alignment: Alignment, correction: Correction) -> PixelMap | Non
     if to_shared.affine.is_identity:
         return shared
     return to_shared.then(shared).then(AffineMap(~to_shared.affine))
+
+
+def placed_bands(alignment: Alignment, path: Path, correction: Correction) -> dict[int, PixelMap]:
+    """Bands of an MS file, by their numbers there, that have a place of their own.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    path : Path
+        Of the file.
+    correction : Correction
+        Of the file, by `correction_of_file`.
+
+    Returns
+    -------
+    dict of int to PixelMap
+        Pixels of the file to those of its header.
+    """
+    from geodelreg.geo.maps.affine import AffineMap
+
+    bands = alignment.solution.bands
+    if not bands or alignment.verdict.outcome is not Outcome.ALIGNED:
+        return {}
+    with open_raster(alignment.source.paths, allow=alignment.options.allow) as reader:
+        stored = reader.stored
+    to_shared = AffineMap(~alignment.source.grid.transform @ correction.original)
+    found: dict[int, PixelMap] = {}
+    for band in bands:
+        file, number = stored[band.number - 1]
+        if Path(file) == path:
+            back = AffineMap(~to_shared.affine)
+            found[number] = to_shared.then(band.map).then(back)
+    return found
 
 
 def revert(*paths: AnyPath) -> None:
@@ -204,7 +251,7 @@ def export_gcps(
 
     check_accepted(alignment)
     gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
-    with together(inputs=lambda: _inputs(alignment)):
+    with together(inputs=lambda: inputs_of(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 
 
@@ -245,7 +292,8 @@ def input_paths(names: Iterable[str], allow: str) -> list[Path]:
     return [*files, *(side for file in files for side in possible_sidecars(file))]
 
 
-def _inputs(alignment: Alignment) -> list[Path]:
+def inputs_of(alignment: Alignment) -> list[Path]:
+    """Whatever an alignment was read from."""
     rasters = [one for one in (alignment.source, alignment.reference) if not one.in_memory]
     names = [path for one in rasters for path in one.paths]
     return input_paths([*names, *masks_of(alignment)], alignment.options.allow)

@@ -59,6 +59,10 @@ Examples:
   Look before you write, and pick one number out of the result:
     geodelreg align ms.tif pan.tif --dry-run --json | jq .accuracy
 
+  Bands that lie apart, each by itself: one file per band, or one resampled raster:
+    geodelreg align ms.tif pan.tif --per-band -o bands/
+    geodelreg align ms.tif pan.tif --per-band -o aligned.tif --warp
+
   Resample onto the grid of PAN instead of correcting the header:
     geodelreg align ms.tif pan.tif -o aligned.tif --warp --grid pan
 
@@ -187,6 +191,11 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
         check_header_holds("field" if options.on_local == "field" else options.model)
     if _carries_all(write_options) and is_default("on_local"):
         options = replace(options, on_local="field")
+    if options.per_band and given["in_place"]:
+        raise click.UsageError(
+            "--per-band finds a place for each band, and a header has one for all: name a folder "
+            "(-o), a .vrt, or resample (--warp)."
+        )
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
     return Request(
@@ -230,14 +239,17 @@ def _check_outputs(request: Request) -> list[Path]:
     masks = (*request.options.masks, *request.options.pan_masks)
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
-        rasters = [] if request.output is None else raster_targets(request.sources, request.output)
+        apart = request.options.per_band and not request.write_options.warp
+        rasters = []
+        if request.output is not None:
+            rasters = raster_targets(request.sources, request.output, apart)
         written = [*rasters, *(path for path in side_files if path != STDOUT)]
         tidy([*written, *(map(Path, request.sources) if request.in_place else ())])
         check_targets(
             inputs,
             [*rasters, *side_files, *([STDOUT] if request.json else [])],
             request.write_options.overwrite,
-            request.output if len(request.sources) > 1 else None,
+            request.output if len(request.sources) > 1 or apart else None,
             rasters,
         )
         for path in request.reports:

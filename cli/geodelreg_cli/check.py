@@ -76,7 +76,9 @@ def check_params() -> list[SectionOption]:
             section=VERDICT,
             help="Print the report on stdout in place of the text; its block is .check.",
         ),
-        *knob_options(AlignOptions, MEASUREMENT, without=[*RUNS, *JUDGED]),
+        *knob_options(
+            AlignOptions, MEASUREMENT, without=[*RUNS, *JUDGED, "per_band", "band_model"]
+        ),
         *run_options(),
     ]
 
@@ -102,7 +104,6 @@ def check(rasters: tuple[str, ...], **given: Any) -> int:
             reference,
             options,
             limit_px=given["limit_px"],
-            per_band=given["per_band"],
             progress=log_steps(bar),
         )
     _show(found, given)

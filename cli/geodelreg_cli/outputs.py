@@ -13,7 +13,7 @@ from geodelreg.geotiff.sidecars import possible_sidecars
 from geodelreg.geotiff.targets import STDOUT, Inputs, check_replaceable
 
 
-def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
+def raster_targets(sources: Sequence[str], output: Path, apart: bool = False) -> list[Path]:
     """Files that the corrected rasters go to: OUT, or one of the same name a source in folder OUT.
 
     Parameters
@@ -21,6 +21,8 @@ def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
     sources : sequence of str
         MS file, or one file per band.
     output : Path
+    apart : bool
+        Each band gets a header of its own: OUT is a folder for them, or a VRT.
 
     Raises
     ------
@@ -29,8 +31,13 @@ def raster_targets(sources: Sequence[str], output: Path) -> list[Path]:
     OutputUnwritableError
         OUT is a folder and should be a file, or the reverse.
     """
+    from geodelreg.product.band_files import band_targets
+    from geodelreg.writing_bands import bands_target
+
     if output == STDOUT:
         raise UsageError("-o -: a raster cannot be written to standard output", "Name a file.")
+    if apart and not bands_target(output, len(sources)):
+        return [out for path in sources for out in band_targets(Path(path), output).values()]
     if len(sources) == 1:
         if output.is_dir():
             raise OutputUnwritableError(

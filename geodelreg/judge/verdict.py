@@ -36,6 +36,8 @@ _LAST_LIMITS = (
     ("keypoints_apart", "≤", 2.0, "coarser px from where keypoints, more certain, put the ground"),
 )
 """After what the user asked; unexplained: ablate."""
+_OF_BANDS = ("bands_apart", "bands")
+"""Not asked where each band is corrected by itself."""
 _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
 SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
@@ -151,7 +153,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     }
     reasons = []
     for name, relation, limit, what in (*_LIMITS, *asked, *_LAST_LIMITS, *whole):
-        if limit is not None:
+        if limit is not None and not (options.per_band and name in _OF_BANDS):
             apart_from = _APART_FROM[options.method == "delaunay"] if what.endswith("and") else ""
             words = f"{what} {apart_from}".rstrip()
             reasons.append(_reason(name, values[name], relation, limit, words))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
@@ -10,6 +12,7 @@ from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.result import BandMap
 
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
@@ -67,6 +70,15 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
             "those of the others; over terrain a local warp would be needed"
         )
     return tuple(notes)
+
+
+def unheard_bands(pair: Pair, bands: Sequence[BandMap]) -> tuple[str, ...]:
+    """Which bands show too little by themselves, and what becomes of them."""
+    heard = {band.number for band in bands}
+    names = [name for n, name in enumerate(pair.source.band_names, 1) if n not in heard]
+    if not names:
+        return ()
+    return (f"too little tells where {', '.join(names)} of MS lies: the common map holds there",)
 
 
 def local_distortion(points: TiePoints) -> float:

@@ -22,9 +22,9 @@ from geodelreg.geotiff import metadata
 from geodelreg.geotiff.header import Provenance
 from geodelreg.geotiff.view import corrected_view
 from geodelreg.options import WriteOptions
+from geodelreg.product.pixels import Validity
 from geodelreg.product.warp import (
     TOLERANCE_PX,
-    Validity,
     edge_on_ground,
     warp_pixels,
     warped_onto,

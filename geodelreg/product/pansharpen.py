@@ -37,8 +37,9 @@ from geodelreg.product.common_grid import (
     recipe_of,
     target_grid,
 )
+from geodelreg.product.pixels import Validity
 from geodelreg.product.scratch import scratch_folder
-from geodelreg.product.warp import Validity, warped_onto
+from geodelreg.product.warp import warped_onto
 from geodelreg.values.raster import Float32Array, Grid
 
 _BLOCK_PX = 512

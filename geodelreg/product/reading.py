@@ -88,6 +88,11 @@ def read_report(path: Path) -> Alignment:
 
 
 def _alignment(report: Mapping[str, Any]) -> Alignment:
+    if report["bands"]:
+        raise ReportError(
+            "the report tells where each band lies, and no one correction is right for all",
+            "Align the other file itself, or make a report without `per_band`.",
+        )
     source = _input(report["inputs"]["source"])
     verdict, warnings = report["verdict"], tuple(map(str, report["warnings"]))
     solution = Solution(

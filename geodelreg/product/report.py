@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,10 @@ from geodelreg.product.motion import header_motion
 from geodelreg.product.provenance import source_date
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import FloatArray, Grid
-from geodelreg.values.result import Alignment, Outcome
+from geodelreg.values.result import Alignment, BandMap, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.4"
+SCHEMA_VERSION = "1.5"
 LATTICE = 17
 """Places along each axis where the standard error of the correction is listed."""
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
@@ -81,6 +81,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
         ],
         "accuracy": asdict(alignment.accuracy),
         "band_weights": dict(alignment.solution.band_weights),
+        "bands": [_band(alignment, band) for band in alignment.solution.bands],
         "masks": [asdict(use) for use in alignment.masks],
         "verdict": {
             "outcome": alignment.verdict.outcome.value,
@@ -154,6 +155,24 @@ def _correction(alignment: Alignment) -> dict[str, Any]:
             "distance_px": motion.distance_px,
             "distance_m": motion.distance_m,
         },
+    }
+
+
+def _band(alignment: Alignment, band: BandMap) -> dict[str, Any]:
+    """Where one band lies, and how it would have to move at its centre."""
+    found: dict[str, Any] = {"corrected_geotransform": None, "pixel_map": band.map.to_json()}
+    affine = band.map.as_affine()
+    if affine is not None:
+        corrected = alignment.source.grid.transform @ affine
+        found = {"corrected_geotransform": corrected.to_gdal(), "pixel_map": None}
+    return {
+        "number": band.number,
+        "name": band.name,
+        "shift_px": header_motion(
+            replace(alignment, solution=replace(alignment.solution, map=band.map))
+        ).shift_px,
+        "sigma_px": band.sigma_px,
+        **found,
     }
 
 

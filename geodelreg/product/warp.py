@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from affine import Affine
-from numpy.typing import NDArray
 
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
@@ -30,55 +28,19 @@ from geodelreg.geotiff.view import corrected_view
 from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product.lookup import looked_up, lookups_of
+from geodelreg.product.pixels import Parts, Validity, annotate, copy_pixels, profile_of
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import BoolArray, FloatArray, Grid
+from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Correction
 
 TOLERANCE_PX = 1e-3
 """Of GDAL's approximation of the way between two CRSs."""
 
-_BLOCK_PX = 256
 _SNAP_PX = 1e-6
 _EDGE_PLACES = 64  # on each edge of a footprint: what bends curves it
 _EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
 """Of resamplings whose name in rasterio is not GDAL's."""
-
-_NOT_CARRIED = metadata.GDAL_DOMAINS | {"GEOLOCATION"}
-
-
-@dataclass(frozen=True, slots=True)
-class Validity:
-    """How pixels without a value are marked: by a value, by the alpha band, or by a mask."""
-
-    nodata: float | None = None
-    alpha_band: int | None = None
-
-    @property
-    def is_mask(self) -> bool:
-        """Neither a value nor the alpha band."""
-        return self.nodata is None and self.alpha_band is None
-
-    def missing(self, data: NDArray[Any]) -> BoolArray:
-        """(B or 1, H, W) where (B, H, W) pixels have no value; of a mask it is the last band."""
-        if self.nodata is None:
-            band = data[-1 if self.alpha_band is None else self.alpha_band - 1]
-            return np.asarray(band == 0)[None]
-        return np.isnan(data) if math.isnan(self.nodata) else np.asarray(data == self.nodata)
-
-    @classmethod
-    def of(cls, dataset: Any) -> Validity:
-        """How an open raster marks them."""
-        from rasterio.enums import ColorInterp, MaskFlags
-
-        if dataset.count > 1 and dataset.colorinterp[-1] is ColorInterp.alpha:
-            return cls(alpha_band=dataset.count)
-        if MaskFlags.per_dataset in dataset.mask_flag_enums[0]:
-            return cls()
-        if dataset.nodata is not None:
-            return cls(nodata=dataset.nodata)
-        is_float = all(np.issubdtype(np.dtype(name), np.floating) for name in dataset.dtypes)
-        return cls(nodata=math.nan) if is_float else cls()
 
 
 def write_warped(
@@ -90,6 +52,7 @@ def write_warped(
     options: WriteOptions,
     reference_path: Path | None = None,
     placement: PixelMap | None = None,
+    bands: Mapping[int, PixelMap] | None = None,
 ) -> list[str]:
     """Resample the corrected source raster north-up through GDAL's warper, once.
 
@@ -113,6 +76,8 @@ def write_warped(
     placement : PixelMap, optional
         Pixels of `source` to those of its original header, where no geotransform holds that:
         ``corrected`` is then not asked.
+    bands : mapping of int to PixelMap, optional
+        The same of bands, from 1, that lie elsewhere than the others.
 
     Returns
     -------
@@ -144,7 +109,9 @@ def write_warped(
                 draft = out.parent.parent / "scratch" / name
                 draft.parent.mkdir()
             with gdal_write(source, target, "GTiff"):
-                notes = warp_pixels(source, draft, content, grid, creation, options, placement)
+                notes = warp_pixels(
+                    source, draft, content, grid, creation, options, placement, bands or {}
+                )
             settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
             content = Provenance(settled, (), tags)
             kept = keep(onto, draft, target)
@@ -240,6 +207,7 @@ def warp_pixels(
     creation: Mapping[str, str],
     options: WriteOptions,
     placement: PixelMap | None,
+    bands: Mapping[int, PixelMap] = MappingProxyType({}),
 ) -> list[str]:
     """Write a GeoTIFF of a raster on a grid, where it really lies, and return warnings."""
     import rasterio
@@ -250,20 +218,28 @@ def warp_pixels(
         validity = Validity.of(view)
         if len({repr(value) for value in view.nodatavals}) > 1:
             notes.append(f"{source.name}: bands differ in no-data, the value of band 1 is used")
-        profile = _profile(view, grid, validity)
+        profile = profile_of(view, grid, validity)
         profile |= {key.lower(): value for key, value in creation.items()}
-        lookups = lookups_of(placement, content.correction, grid, view.shape)
+        ways = [resampling, *(["nearest"] if flags else [])]
         with ExitStack() as stack:
-            parts = []
-            for lookup in lookups:
-                ways = [resampling, *(["nearest"] if flags else [])]
-                plain = [stack.enter_context(warped_onto(view, grid, validity, w)) for w in ways]
-                if lookup is not None:
-                    plain = [stack.enter_context(looked_up(name, one, lookup)) for one in plain]
-                parts.append(plain)
+
+            def parts_of(placement: PixelMap | None) -> Parts:
+                parts = []
+                for lookup in lookups_of(placement, content.correction, grid, view.shape):
+                    plain = [
+                        stack.enter_context(warped_onto(view, grid, validity, w)) for w in ways
+                    ]
+                    if lookup is not None:
+                        plain = [stack.enter_context(looked_up(name, one, lookup)) for one in plain]
+                    parts.append(plain)
+                return parts
+
+            rest = [number for number in view.indexes if number not in bands]
+            layers = [(rest, parts_of(placement))] if rest else []
+            layers += [([number], parts_of(bands[number])) for number in sorted(bands)]
             dataset = stack.enter_context(rasterio.open(out, "w", **profile))
-            _annotate(view, dataset)
-            _copy_pixels(parts, flags, dataset, validity)
+            annotate(view, dataset)
+            copy_pixels(layers, flags, dataset, validity)
     _copy_overviews(source, out, "nearest" if flags or resampling == "nearest" else "average")
     compare.check_decodable(out)
     return notes
@@ -291,36 +267,6 @@ def _resampling(
     return options.resampling, flags
 
 
-def _profile(view: Any, grid: Grid, validity: Validity) -> dict[str, Any]:
-    from rasterio.enums import ColorInterp
-
-    kinds = {np.dtype(compare.numpy_type(name)).kind for name in view.dtypes}
-    predictor = {"f": "3", "i": "2", "u": "2"}.get(kinds.pop()) if len(kinds) == 1 else None
-    photometric = {
-        (ColorInterp.red, ColorInterp.green, ColorInterp.blue): "RGB",
-        (ColorInterp.palette,): None,
-    }.get(view.colorinterp[:3], "MINISBLACK")
-    height, width = grid.shape
-    return {
-        "driver": "GTiff",
-        "height": height,
-        "width": width,
-        "count": view.count,
-        "dtype": view.dtypes[0],
-        "crs": grid.crs_wkt,
-        "transform": grid.transform,
-        "nodata": validity.nodata,
-        "tiled": "YES",
-        "blockxsize": str(_BLOCK_PX),
-        "blockysize": str(_BLOCK_PX),
-        "compress": "DEFLATE",
-        "predictor": predictor or "1",
-        "bigtiff": "IF_SAFER",
-        "interleave": view.interleaving.value if view.interleaving else "pixel",
-        **({"photometric": photometric} if photometric else {}),
-    }
-
-
 @contextmanager
 def warped_onto(view: Any, grid: Grid, validity: Validity, resampling: str) -> Iterator[Any]:
     """An open raster on a grid, resampled when read; its masks say what is covered."""
@@ -345,46 +291,6 @@ def warped_onto(view: Any, grid: Grid, validity: Validity, resampling: str) -> I
         **settings,
     ) as warped:
         yield warped
-
-
-def _annotate(view: Any, dataset: Any) -> None:
-    """Give the output what describes the bands, apart from statistics of the old pixels."""
-    if view.dtypes[0] in ("uint8", "uint16"):
-        _copy_colormaps(view, dataset)
-    dataset.colorinterp = view.colorinterp
-    dataset.descriptions = metadata.attribute(view, "descriptions") or (None,) * view.count
-    dataset.scales, dataset.offsets = view.scales, view.offsets
-    dataset.units = [unit or "" for unit in metadata.attribute(view, "units") or [""] * view.count]
-    for band in (0, *view.indexes):
-        domains = metadata.domains(view, band) - _NOT_CARRIED
-        for domain in sorted(name for name in domains if not name.startswith("xml:")):
-            items = metadata.tags(view, band, domain)
-            kept = {k: v for k, v in items.items() if not k.startswith("STATISTICS_")}
-            dataset.update_tags(band, ns=domain or None, **kept)
-
-
-def _copy_colormaps(view: Any, dataset: Any) -> None:
-    for band in view.indexes:
-        colormap = metadata.colormap(view, band)
-        if colormap is not None:
-            dataset.write_colormap(band, colormap)
-
-
-def _copy_pixels(
-    parts: Sequence[Sequence[Any]], flags: Sequence[int], dataset: Any, validity: Validity
-) -> None:
-    """Copy window by window; of parts that overlap the first that has a pixel gives it."""
-    for window in compare.windows_of(dataset):
-        data = None
-        for warped, *nearest in parts:
-            here = warped.read(window=window)
-            for flat in nearest:
-                here[[number - 1 for number in flags]] = flat.read(list(flags), window=window)
-            data = here if data is None else np.where(validity.missing(data), here, data)
-        assert data is not None
-        dataset.write(data[: dataset.count], window=window)
-        if validity.is_mask:
-            dataset.write_mask(data[-1] != 0, window=window)
 
 
 def _copy_overviews(source: Path, out: Path, resampling: str) -> None:

@@ -82,6 +82,7 @@ class RasterReader:
         self.in_memory = not all(file.opened.is_file for file in files)
         self.other_paths = tuple(file.path for file in files if file not in self._files)
         self._bands = _list_bands(self._files)
+        self._stored = [(self._files[band.file], band.number) for band in self._bands]
         self._decimations = self._common_decimations()
 
     def __enter__(self) -> RasterReader:
@@ -119,17 +120,17 @@ class RasterReader:
     @property
     def dtypes(self) -> tuple[str, ...]:
         """Pixel type of each band, as stored."""
-        return tuple(
-            str(self._files[band.file].dataset.dtypes[band.number - 1]) for band in self._bands
-        )
+        return tuple(str(of.dataset.dtypes[n - 1]) for of, n in self._stored)
 
     @property
     def colours(self) -> tuple[str, ...]:
         """What GDAL takes each band for, as ``red``, ``gray`` or ``undefined``."""
-        return tuple(
-            str(self._files[band.file].dataset.colorinterp[band.number - 1].name)
-            for band in self._bands
-        )
+        return tuple(str(of.dataset.colorinterp[n - 1].name) for of, n in self._stored)
+
+    @property
+    def stored(self) -> tuple[tuple[str, int], ...]:
+        """File of each band, and its number there, from 1."""
+        return tuple((of.path, n) for of, n in self._stored)
 
     @property
     def decimations(self) -> tuple[float, ...]:

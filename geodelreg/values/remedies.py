@@ -24,8 +24,9 @@ _REMEDIES = (
     (
         {"bands", "bands_apart"},
         (
-            "The bands of MS do not agree, or show clouds: match on one of them (`band=N`); the "
-            "correction is then right for the bands that lie with it."
+            "The bands of MS do not agree, or show clouds: correct each by itself "
+            "(`per_band=True`), or match on one of them (`band=N`); the correction is then right "
+            "for the bands that lie with it."
         ),
     ),
     (

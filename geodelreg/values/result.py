@@ -190,6 +190,27 @@ class Accuracy:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BandMap:
+    """Where one MS band lies, matched by itself.
+
+    Attributes
+    ----------
+    number : int
+        From 1.
+    name : str
+    map : PixelMap
+        Its MS pixels to MS header pixels.
+    sigma_px : float
+        Standard error of the place at the raster's centre, PAN pixels.
+    """
+
+    number: int
+    name: str
+    map: PixelMap
+    sigma_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """What the two images say: a map, with everything known about it.
 
@@ -209,6 +230,8 @@ class Solution:
     warnings : tuple of str
     search : str
         Which search led to it: ``header``, ``keypoints``, ``whole``; ``none`` when none did.
+    bands : tuple of BandMap
+        With ``per_band`` those of the bands that show enough by themselves, else none.
     """
 
     model: str
@@ -220,6 +243,7 @@ class Solution:
     band_weights: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     search: str = "none"
+    bands: tuple[BandMap, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,167 @@
+"""Bands that lie apart: each is corrected by itself, in headers or by resampling."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from click.testing import CliRunner
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import geodelreg
+from benchmarks.scenes.imagery import sample_imagery
+from benchmarks.scenes.make import HeaderError, Scene, SceneSpec, make_scene, write_scene
+from geodelreg import Alignment, AlignOptions, WriteOptions
+from geodelreg.errors import AlignmentRefusedError, ReportError, UsageError
+from geodelreg.product.report import report_dict, report_schema
+from geodelreg_cli.main import cli
+
+Array = NDArray[np.float64]
+RATIO = 4.0
+SPEC = SceneSpec("apart", "", HeaderError((2.3, -1.7)), (800, 800), (180, 180), ratio=RATIO)
+SHIFTS_PX = ((0.0, 0.0), (0.9, -0.3), (1.5, 0.4), (-0.2, 1.8))
+"""Of the content of each band, PAN pixels to the right and down."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """Two files, their truth and what was found out."""
+
+    ms: Path
+    pan: Path
+    scene: Scene
+    alignment: Alignment
+
+    def pan_px(self, transform: Affine, at: Array) -> Array:
+        """(N, 2) PAN pixels of MS pixels by a geotransform of MS."""
+        step = ~Affine(*self.scene.truth.pan) @ transform
+        return np.stack(step @ (at[:, 0], at[:, 1]), axis=1)
+
+
+def made(folder: Path, shifts: tuple[tuple[float, float], ...]) -> Made:
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=shifts)
+    write_scene(scene, folder)
+    files = folder / "ms.tif", folder / "pan.tif"
+    return Made(*files, scene, geodelreg.align(*files, AlignOptions(per_band=True)))
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return made(tmp_path_factory.mktemp("apart"), SHIFTS_PX)
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return made(tmp_path_factory.mktemp("twin"), ((0.0, 0.0),) * 4)
+
+
+def lattice() -> Array:
+    axis = np.linspace(5, 175, 12)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+def errors_px(made: Made, shifts: tuple[tuple[float, float], ...]) -> list[Array]:
+    """(N, 2) of each band, PAN pixels, over the raster."""
+    at, truth = lattice(), Affine(*made.scene.truth.ms_true)
+    header = Affine(*made.scene.truth.ms_header)
+    return [
+        made.pan_px(header, band.map.forward(at)) - made.pan_px(truth, at) - np.array(shift)
+        for band, shift in zip(made.alignment.solution.bands, shifts, strict=True)
+    ]
+
+
+def rms(vectors: Array) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))
+
+
+def test_each_band_is_put_where_it_lies(apart: Made, twin: Made) -> None:
+    """But for what the bands of the imagery itself are apart, which the unshifted twin shows."""
+    moved, still = (
+        np.array([error.mean(axis=0) for error in errors_px(*one)])
+        for one in ((apart, SHIFTS_PX), (twin, ((0.0, 0.0),) * 4))
+    )
+    assert np.hypot(*(moved - still).T).max() < 0.03
+    for band, gap in zip(apart.alignment.solution.bands, moved - still, strict=True):
+        assert np.hypot(*gap) < 4 * band.sigma_px
+        assert band.sigma_px < 0.1
+    assert apart.alignment.verdict.accepted
+
+
+def test_without_it_the_refusal_names_it(apart: Made) -> None:
+    with pytest.raises(AlignmentRefusedError, match="two MS bands") as caught:
+        geodelreg.align(apart.ms, apart.pan)
+    assert "per_band=True" in caught.value.remedy
+
+
+def test_the_report_tells_of_each_band_and_is_not_applied(apart: Made, tmp_path: Path) -> None:
+    report = json.loads(json.dumps(report_dict(apart.alignment)))
+    jsonschema.validate(report, report_schema())
+    shifts = np.array([band["shift_px"] for band in report["bands"]])
+    assert np.abs(shifts - shifts[0] - np.array(SHIFTS_PX) + SHIFTS_PX[0]).max() < 1.0
+    (tmp_path / "report.json").write_text(json.dumps(report), "utf-8")
+    with pytest.raises(ReportError, match="each band"):
+        geodelreg.apply(tmp_path / "report.json", apart.ms, tmp_path / "out.tif")
+
+
+def test_each_file_of_a_folder_has_its_header_and_the_same_pixels(
+    apart: Made, tmp_path: Path
+) -> None:
+    out = tmp_path / "bands"
+    command = ["align", str(apart.ms), str(apart.pan), "--per-band", "-q", "-o", str(out)]
+    run = CliRunner().invoke(cli, command)
+    assert run.exit_code == 0, run.output
+    with rasterio.open(apart.ms) as ms:
+        pixels, header = ms.read(), ms.transform
+    files = sorted(out.iterdir())
+    assert len(files) == len(SHIFTS_PX)
+    for path, band, data in zip(files, apart.alignment.solution.bands, pixels, strict=True):
+        with rasterio.open(path) as dataset:
+            assert dataset.count == 1
+            assert (dataset.read(1) == data).all()
+            affine = band.map.as_affine()
+            assert affine is not None
+            assert dataset.transform.almost_equals(header @ affine, 1e-6)
+
+
+def resampled(apart: Made, number: int, grid: rasterio.DatasetReader) -> Array:
+    """Band of MS on a grid, by scipy's bilinear interpolation where the band lies."""
+    affine = apart.alignment.solution.bands[number - 1].map.as_affine()
+    assert affine is not None
+    with rasterio.open(apart.ms) as ms:
+        back = ~(ms.transform @ affine) @ grid.transform
+        source = ms.read(number).astype(float)
+    rows, columns = np.mgrid[: grid.height, : grid.width] + 0.5
+    x, y = back @ (columns.ravel(), rows.ravel())
+    found = ndimage.map_coordinates(source, [y - 0.5, x - 0.5], order=1)
+    return np.asarray(found.reshape(grid.shape))
+
+
+@pytest.mark.parametrize("name", ["out.tif", "out.vrt"])
+def test_bands_are_resampled_to_where_they_lie(apart: Made, tmp_path: Path, name: str) -> None:
+    out, warp = tmp_path / name, name.endswith("tif")
+    geodelreg.write(apart.alignment, out, WriteOptions(warp=warp, resampling="bilinear"))
+    with rasterio.open(out) as dataset:
+        assert dataset.count == len(SHIFTS_PX)
+        inner = slice(10, min(dataset.shape) - 10)
+        for number in dataset.indexes:
+            got = dataset.read(number).astype(float)[inner, inner]
+            expected = resampled(apart, number, dataset)[inner, inner]
+            assert np.std(got - expected) < 0.02 * np.std(expected)
+
+
+def test_what_has_one_place_for_all_bands_is_refused(apart: Made, tmp_path: Path) -> None:
+    for target in (tmp_path / "out.tif", tmp_path / "out.jp2"):
+        with pytest.raises(UsageError, match="one for all"):
+            geodelreg.write(apart.alignment, target)
+    with pytest.raises(UsageError, match="one for all"):
+        geodelreg.write_in_place(apart.alignment)
+    with pytest.raises(UsageError, match="each band"):
+        AlignOptions(per_band=True, band=2)
+    assert not list(tmp_path.iterdir())
