@@ -20,7 +20,13 @@ if TYPE_CHECKING:
     from geodelreg.report.output import write_report
     from geodelreg.sharpen import pansharpen
     from geodelreg.values.raster import Grid
-    from geodelreg.writing import export_gcps, revert, write, write_in_place
+    from geodelreg.writing import (
+        export_gcps,
+        revert,
+        write,
+        write_displacement,
+        write_in_place,
+    )
 
 
 __all__ = [
@@ -39,6 +45,7 @@ __all__ = [
     "pansharpen",
     "revert",
     "write",
+    "write_displacement",
     "write_in_place",
     "write_report",
 ]
@@ -57,6 +64,7 @@ _HOMES = {
     "pansharpen": "geodelreg.sharpen",
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
+    "write_displacement": "geodelreg.writing",
     "write_in_place": "geodelreg.writing",
     "write_report": "geodelreg.report.output",
 }

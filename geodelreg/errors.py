@@ -129,7 +129,7 @@ class GcpFormatError(GeodelregError):
 
 
 class ReportError(GeodelregError):
-    """The JSON report is none, is of another version, of a refusal, or tells of other rasters."""
+    """A report or a displacement is none, of another version or a refusal, or of other rasters."""
 
 
 class CorrectionMisfitError(GeodelregError):

@@ -30,6 +30,7 @@ FLAGS = {
     "write": ("-o",),
     "write_in_place": ("--in-place",),
     "export_gcps": ("--gcps",),
+    "write_displacement": ("--displacement",),
     "write_report": ("--report",),
 }
 """Flags that GDAL's users know by another name than the knob's, or that are functions in Python."""

@@ -255,6 +255,32 @@ def export_gcps(
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 
 
+@as_allowed
+def write_displacement(alignment: Alignment, path: AnyPath, overwrite: bool = False) -> None:
+    """Write how far the correction moves every place, as a GeoTIFF for other programs.
+
+    Its bands are metres east and north, PAN pixels right and down, and the standard error; with
+    ``per_band`` they are those of the common map.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    path : path
+    overwrite : bool
+
+    Raises
+    ------
+    AlignmentRefusedError, CrsTransformError
+    OutputExistsError, OutputIsInputError, OutputUnwritableError
+    """
+    from geodelreg.geotiff.atomic import together
+    from geodelreg.product.displacement import write_grid
+
+    check_accepted(alignment)
+    with together(inputs=lambda: inputs_of(alignment)):
+        write_grid(alignment, Path(path), overwrite)
+
+
 def check_accepted(alignment: Alignment) -> None:
     """Write nothing of a refused alignment: its map is no correction.
 

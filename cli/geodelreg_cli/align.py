@@ -82,6 +82,7 @@ class Request:
     gcps: tuple[Path, ...]
     gcp_format: str | None
     reports: tuple[Path, ...]
+    displacement: Path | None
     figure: Path | None
     figure_kind: str
     json: bool
@@ -141,6 +142,14 @@ def align_params() -> list[SectionOption]:
             help="Write everything that was found out; also after a refusal. .html is a page to "
             "look at, with before and after (needs the report extra); else JSON. - writes JSON to "
             "stdout. May be repeated.",
+        ),
+        flag(
+            "--displacement",
+            type=FILE,
+            metavar="FILE.tif",
+            section=OUTPUT,
+            help="Write how far every place moves, as a GeoTIFF: metres east and north, PAN pixels "
+            "right and down, standard error.",
         ),
         flag(
             "--figure",
@@ -207,6 +216,7 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
         gcps=given["gcps"],
         gcp_format=given["gcp_format"],
         reports=given["report"],
+        displacement=given["displacement"],
         figure=given["figure"],
         figure_kind=given["figure_kind"],
         json=given["json"],
@@ -232,10 +242,14 @@ def _check_outputs(request: Request) -> list[Path]:
     from geodelreg.geotiff.atomic import tidy
     from geodelreg.geotiff.targets import STDOUT, Inputs
     from geodelreg.report.output import check_report
-    from geodelreg_cli.outputs import check_targets, raster_targets
+    from geodelreg_cli.outputs import check_gcp_formats, check_targets, raster_targets
 
-    _check_gcp_formats(request)
-    side_files = [path for path in (*request.gcps, *request.reports, request.figure) if path]
+    if request.gcp_format is None:
+        check_gcp_formats(request.gcps)
+    moves = request.displacement
+    if moves == STDOUT:
+        raise click.UsageError("--displacement -: a raster cannot be written to standard output.")
+    side_files = [path for path in (*request.gcps, *request.reports, moves, request.figure) if path]
     masks = (*request.options.masks, *request.options.pan_masks)
     inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
     try:
@@ -269,20 +283,6 @@ def _check_outputs(request: Request) -> list[Path]:
     for path in written:
         known.check(path)
     return read
-
-
-def _check_gcp_formats(request: Request) -> None:
-    if not request.gcps or request.gcp_format is not None:
-        return
-    from geodelreg.product.gcps import GCP_FORMATS
-
-    known = {suffix for spec in GCP_FORMATS.values() for suffix in spec.extensions}
-    for path in request.gcps:
-        if path.suffix.lower() not in known:
-            raise click.UsageError(
-                f"--gcps {path}: the extension says no format; add --gcp-format, or use one of "
-                + ", ".join(sorted(known))
-            )
 
 
 def _run(request: Request, inputs: Sequence[Path]) -> None:
@@ -327,7 +327,9 @@ def _named(request: Request) -> str:
 
 def _written(request: Request) -> str:
     """The outputs, in one line."""
-    paths = [request.output, *request.gcps, *request.reports, request.figure]
+    paths = [
+        request.output, *request.gcps, *request.reports, request.displacement, request.figure
+    ]  # fmt: skip
     names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
     if request.in_place:
         names = f"the header of MS{', ' if names else ''}{names}"
@@ -362,6 +364,8 @@ def _write(alignment: Alignment, request: Request) -> None:
         warnings = geodelreg.write(alignment, request.output, request.write_options)
     for warning in (*alignment.warnings, *warnings):
         logging.getLogger(__name__).warning("warning: %s", warning)
+    if request.displacement is not None:
+        geodelreg.write_displacement(alignment, request.displacement, overwrite)
     for path in request.gcps:
         geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite=overwrite)
 

@@ -7,6 +7,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import click
+
 from geodelreg.errors import OutputUnwritableError, UsageError
 from geodelreg.geotiff.durable import unwritable
 from geodelreg.geotiff.sidecars import possible_sidecars
@@ -109,3 +111,21 @@ def check_targets(
             raise unwritable(target, FileNotFoundError(errno.ENOENT, "no such folder"))
         if not os.access(folder, os.W_OK):
             raise unwritable(target, PermissionError(errno.EACCES, "permission denied"))
+
+
+def check_gcp_formats(paths: Sequence[Path]) -> None:
+    """Refuse control points of which the extension says no format.
+
+    Raises
+    ------
+    click.UsageError
+    """
+    from geodelreg.product.gcps import GCP_FORMATS
+
+    known = {suffix for spec in GCP_FORMATS.values() for suffix in spec.extensions}
+    for path in paths:
+        if path.suffix.lower() not in known:
+            raise click.UsageError(
+                f"--gcps {path}: the extension says no format; add --gcp-format, or use one of "
+                + ", ".join(sorted(known))
+            )

@@ -67,7 +67,7 @@ def header_motion(alignment: Alignment) -> HeaderMotion:
         in_pan = map_points(np.stack([before, after]), source.crs_wkt, reference.crs_wkt)
         pan_px = apply_affine(~reference.transform, in_pan)
         shift_px = pan_px[1] - pan_px[0]
-        metres = _metres_per_unit(source, before)
+        metres = metres_per_unit(source, before)
     except CrsTransformError as error:
         logger.debug("shift in pixels and metres unknown: %s", error)
         shift_px, metres = unknown, unknown
@@ -87,8 +87,13 @@ def header_motion(alignment: Alignment) -> HeaderMotion:
     )
 
 
-def _metres_per_unit(source: Grid, at: FloatArray) -> FloatArray:
-    """Metres that one map unit is long, along the x and the y axis, near a place of the map."""
+def metres_per_unit(source: Grid, at: FloatArray) -> FloatArray:
+    """Metres that one map unit is long, along the x and the y axis, near a place of the map.
+
+    Raises
+    ------
+    CrsTransformError
+    """
     step = math.sqrt(abs(source.transform.determinant))
     pixel = Affine(step, 0.0, at[0] - step / 2, 0.0, -step, at[1] + step / 2)
     return np.array(gsd_px_m(Grid(pixel, (1, 1), source.crs_wkt, source.unit_m))) / step
