@@ -23,6 +23,10 @@ COMMANDS = {
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
     "wald": ("benchmarks.sharpening.wald", "what alignment is worth to pansharpening"),
+    "ramps": (
+        "benchmarks.sharpening.ramps",
+        "sharpened ramps: every pixel in its place",
+    ),
     "batch": ("benchmarks.batch.run", "many pairs: throughput, Dask, kills, a huge manifest"),
     "browser": ("benchmarks.browser.run", "the pages of reports in headless Chromium"),
     "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),

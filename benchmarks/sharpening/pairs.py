@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from rasterio.vrt import WarpedVRT
 
 import geodelreg
 
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_tiles"
 Float32Array = NDArray[np.float32]
 _LARGEST_SIDE = 480
 _PAN_WEIGHTS = (0.15, 0.3, 0.35, 0.2)
@@ -76,22 +78,26 @@ IMAGERY = {
 
 
 def known_pairs(data: Path) -> Iterator[Known]:
-    """All pairs that the folder has the files of."""
+    """The pair of this repository, and all that the folder has the files of."""
+    truth = json.loads((SAMPLE / "truth.json").read_text("utf-8"))
+    files, placed = (SAMPLE / "ms.tif", SAMPLE / "pan.tif"), Affine(*truth["ms_true"])
+    yield degraded_pair("sample_tiles", *files, 4, placed, is_real=False)
     for name, (ms, pan, ratio) in REAL.items():
         if (data / ms).exists() and (data / pan).exists():
-            yield real_pair(name, data / ms, data / pan, ratio)
+            placed = geodelreg.align(data / ms, data / pan).correction.corrected
+            yield degraded_pair(name, data / ms, data / pan, ratio, placed, is_real=True)
     for name, (path, bands, ratios) in IMAGERY.items():
         for ratio in ratios if (data / path).exists() else ():
             yield simulated_pair(f"{name} {ratio}:1", data / path, bands, ratio)
 
 
-def real_pair(name: str, ms: Path, pan: Path, ratio: int) -> Known:
+def degraded_pair(
+    name: str, ms: Path, pan: Path, ratio: int, placed: Affine, is_real: bool
+) -> Known:
     """MS is what sharpening should give; PAN is averaged onto its pixels, where they truly lie."""
-    alignment = geodelreg.align(ms, pan)
     with rasterio.open(ms) as dataset:
         reference = dataset.read().astype(np.float32)
         crs = dataset.crs
-    placed = alignment.correction.corrected
     with (
         rasterio.open(pan) as dataset,
         WarpedVRT(
@@ -109,7 +115,7 @@ def real_pair(name: str, ms: Path, pan: Path, ratio: int) -> Known:
         rows, columns = _covered(warped.read(warped.count) > 0, ratio)
     return Known(
         name,
-        True,
+        is_real,
         ratio,
         reference[:, rows, columns] * _gain(reference),
         averaged[rows, columns] * _gain(averaged),

@@ -33,10 +33,10 @@ _HEADING = """## What alignment is worth to pansharpening
 `python -m benchmarks wald --data DIR --docs docs/benchmarks.md` ({machine}).
 Wald's protocol: MS and PAN are averaged down by their ratio and sharpened with
 `geodelreg pansharpen`; the result is compared with MS itself. Real pairs have a PAN of its own
-sensor. Of the others PAN is a sum of the bands of a real image, with 0.3 % of noise. The header of
-MS is then wrong by so many PAN pixels. ERGAS, SAM, SCC and QNR are those of
-sewar. No kept package has Q2n, so it is the benchmark's own,
-tested against quaternions. ERGAS and SAM are best at 0, the others at 1."""
+sensor. `sample_tiles` lies where its `truth.json` says. Of the others PAN is a sum of the bands of
+a real image, with 0.3 % of noise. The header of MS is then wrong by so many PAN pixels. ERGAS, SAM,
+SCC and QNR are those of sewar. No kept package has Q2n, so it is the benchmark's own, tested
+against quaternions. ERGAS and SAM are best at 0, the others at 1."""
 _IMAGES = """![ERGAS and SAM against the misalignment](images/wald.png)
 
 Crops of a real pair at 2:1 and of a simulated one at 4:1, 3 PAN px off:
