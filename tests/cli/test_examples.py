@@ -252,6 +252,27 @@ def test_script_tells_a_refusal(tmp_path: Path, blank: bool, outcome: str) -> No
         assert dataset.shape == (400, 400)
 
 
+def test_gdals_own_tools_sharpen_the_same(tmp_path: Path) -> None:
+    if shutil.which("gdalwarp") is None or shutil.which("gdal_pansharpen.py") is None:
+        pytest.skip("GDAL's programs are not installed")
+    page = "docs/tutorials/pansharpening.md"
+    corner(tmp_path)
+    (recipe,) = examples(page, "bash")
+    assert "gdalwarp" in recipe[1]
+    run_examples(page, tmp_path, free_port(), "bash")
+    geodelreg.pansharpen(
+        tmp_path / "aligned.tif", tmp_path / "pan.tif", tmp_path / "ours.tif", weights="equal"
+    )
+    with (
+        rasterio.open(tmp_path / "ours.tif") as ours,
+        rasterio.open(tmp_path / "sharp.tif") as theirs,
+    ):
+        assert (ours.transform, ours.shape) == (theirs.transform, theirs.shape)
+        covered = ours.dataset_mask() > 0
+        apart = np.abs(ours.read().astype(int) - theirs.read())[:, covered]
+    assert apart.max() <= 1
+
+
 def test_every_page_that_is_prepared_has_examples() -> None:
     assert all(examples(page) for page in (*PAGES, SCRIPT))
 
