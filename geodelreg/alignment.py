@@ -14,7 +14,7 @@ from geodelreg.product.motion import HeaderMotion, header_motion
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.product.report import report_dict, short, summary_text, with_metres
 from geodelreg.raster.arrays import is_xarray, placed_again, xarray_dataset
-from geodelreg.raster.opening import dataset_grid
+from geodelreg.raster.inputs import Opened
 from geodelreg.values import result
 from geodelreg.values.points import Status
 
@@ -141,7 +141,7 @@ class Alignment(result.Alignment):
             )
         name = type(raster).__name__
         dataset = xarray_dataset(raster, name)
-        grid = dataset_grid(name, dataset)
+        grid = Opened(name, dataset, is_file=False).grid()
         if not _same_crs(grid.crs_wkt, self.correction.crs_wkt):
             raise UsageError(
                 f"{name} has another coordinate reference system than MS",

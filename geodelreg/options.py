@@ -6,8 +6,9 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from numbers import Integral, Real
 from typing import Any
 
 from geodelreg.errors import UsageError
@@ -53,10 +54,20 @@ def _check_masks(options: object, name: str) -> None:
     object.__setattr__(options, name, masks)
 
 
+def _check_creation(options: WriteOptions | PansharpenOptions) -> None:
+    given = options.creation_options
+    if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
+        raise TypeError(f"`creation_options={given!r}` is no sequence of KEY=VALUE")
+    for option in given:
+        if not isinstance(option, str) or "=" not in option:
+            raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+
+
 def _check_number(options: object, name: str) -> None:
-    value = getattr(options, name)
-    if value is not None and not isinstance(value, int | float):
-        raise TypeError(f"`{name}={value!r}` is no number")
+    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    value, is_whole = getattr(options, name), str(spec.type).startswith("int")
+    if value is not None and not isinstance(value, Integral if is_whole else Real):
+        raise TypeError(f"`{name}={value!r}` is no {'whole ' if is_whole else ''}number")
 
 
 def _keep_list(options: object, name: str) -> None:
@@ -277,9 +288,7 @@ class WriteOptions:
         _check_choice(self, "georef")
         _check_choice(self, "warp_grid")
         _check_choice(self, "resampling")
-        for option in self.creation_options:
-            if "=" not in option:
-                raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+        _check_creation(self)
         if self.warp and self.georef == "gcps":
             raise UsageError(
                 "`warp=True` and `georef='gcps'` exclude each other", "Drop one of them."
@@ -366,9 +375,7 @@ class PansharpenOptions:
         _check_number(self, "nodata")
         _keep_list(self, "weights")
         _keep_list(self, "bands")
-        for option in self.creation_options:
-            if "=" not in option:
-                raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+        _check_creation(self)
         if self.weights not in ("auto", "equal"):
             self.given_weights()
         self.given_bands()

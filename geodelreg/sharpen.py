@@ -30,6 +30,7 @@ from geodelreg.values.result import Alignment, Correction
 from geodelreg.writing import (
     AnyPath,
     check_accepted,
+    check_is_no_stream,
     correction_of_file,
     input_paths,
     masks_of,
@@ -85,6 +86,7 @@ def pansharpen(
         When an argument is of the wrong type.
     """
     options = replace(options or PansharpenOptions(), **knobs)
+    check_is_no_stream(Path(target))
     if alignment is not None:
         check_accepted(alignment)
     masks = [] if alignment is None else masks_of(alignment)

@@ -12,6 +12,7 @@ from typing import Unpack
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import as_allowed
 from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError, UsageError
+from geodelreg.geotiff.targets import STDOUT
 from geodelreg.knobs import WriteKnobs
 from geodelreg.masking import parse_mask
 from geodelreg.options import WriteOptions, check_header_holds
@@ -286,8 +287,10 @@ def check_accepted(alignment: Alignment) -> None:
 
     Raises
     ------
-    AlignmentRefusedError
+    AlignmentRefusedError, TypeError
     """
+    if not isinstance(alignment, Alignment):
+        raise TypeError(f"{type(alignment).__name__} is no Alignment")
     if not alignment.verdict.accepted:
         name = Path(alignment.source.paths[0]).name
         raise AlignmentRefusedError(
@@ -339,6 +342,17 @@ def check_is_file(alignment: Alignment) -> None:
         )
 
 
+def check_is_no_stream(target: Path) -> None:
+    """Refuse a raster on standard output.
+
+    Raises
+    ------
+    UsageError
+    """
+    if target == STDOUT:
+        raise UsageError("A raster cannot be written to standard output", "Name a file.")
+
+
 def masks_of(alignment: Alignment) -> list[str]:
     """Files of the masks that an alignment was told of."""
     options = alignment.options
@@ -348,10 +362,7 @@ def masks_of(alignment: Alignment) -> list[str]:
 @contextmanager
 def _targets(alignment: Alignment, target: Path) -> Iterator[list[tuple[Path, Path]]]:
     """MS files with their outputs; the folder for several is made, and taken back on an error."""
-    from geodelreg.geotiff.targets import STDOUT
-
-    if target == STDOUT:
-        raise UsageError("A raster cannot be written to standard output", "Name a file.")
+    check_is_no_stream(target)
     sources = [as_path(path) for path in alignment.source.paths]
     if len(sources) == 1:
         yield [(sources[0], target)]

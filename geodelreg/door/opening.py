@@ -26,7 +26,7 @@ from geodelreg.door.names import (
     needed_access,
     subdataset_of,
 )
-from geodelreg.errors import RasterNotFoundError, RasterUnreadableError
+from geodelreg.errors import RasterNotFoundError, RasterUnreadableError, UsageError
 
 if TYPE_CHECKING:
     from zipfile import Path as ZipPath
@@ -70,7 +70,15 @@ def allowed() -> str:
 
 @contextmanager
 def allowing(allow: str) -> Iterator[None]:
-    """Let `open_raster` open more than local files, in this thread."""
+    """Let `open_raster` open more than local files, in this thread.
+
+    Raises
+    ------
+    UsageError
+        There is no such permission.
+    """
+    if allow not in (LOCAL, NETWORK, ALL):
+        raise UsageError(f"`allow={allow!r}` is unknown", "Use local, network or all.")
     token = _allowed.set(allow)
     try:
         yield
@@ -79,10 +87,15 @@ def allowing(allow: str) -> Iterator[None]:
 
 
 def as_allowed(function: _Function) -> _Function:
-    """Let a function whose first argument is an `Alignment` open what that was allowed to."""
+    """Let a function whose first argument is an `Alignment` open what that was allowed to.
+
+    It raises `TypeError` for anything else.
+    """
 
     @wraps(function)
     def inside(alignment: Any, *args: Any, **kwargs: Any) -> Any:
+        if not hasattr(alignment, "options"):
+            raise TypeError(f"{type(alignment).__name__} is no Alignment")
         with allowing(alignment.options.allow):
             return function(alignment, *args, **kwargs)
 

@@ -167,8 +167,10 @@ def array_dataset(array: Any, grid: Grid, name: str) -> ArrayDataset:
     ------
     ArrayShapeError, MissingCrsError
     TypeError
-        It holds no numbers.
+        It holds no numbers, or the grid no geotransform.
     """
+    if not isinstance(grid.transform, Affine):
+        raise TypeError(f"the transform of the grid of {name} is no Affine: {grid.transform!r}")
     shape = tuple(int(side) for side in array.shape)
     if len(shape) not in (2, 3) or shape[-2:] != tuple(grid.shape) or 0 in shape:
         raise ArrayShapeError(
@@ -368,11 +370,13 @@ def _number_type(dtype: Any, name: str) -> str:
     return "uint8" if kind == "b" else str(np.dtype(dtype))
 
 
-def _crs(text: str, name: str) -> Any:
-    """CRS of WKT or a code; addresses are not fetched and files not opened."""
+def _crs(text: str | None, name: str) -> Any:
+    """CRS of WKT or a code, if any; addresses are not fetched and files not opened."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
+    if not text:
+        return None
     try:
         return CRS.from_string(text) if _CODE.match(text) else CRS.from_wkt(text)
     except CRSError as error:

@@ -43,7 +43,7 @@ AnyMask: TypeAlias = AnyRaster | NDArray[Any]
 """A mask: a bare array lies on the pixels of its image."""
 
 _REMEDIES: dict[type[GeodelregError], str] = {
-    MissingCrsError: 'Assign the right one: raster.rio.write_crs("EPSG:…").',
+    MissingCrsError: 'Assign the right one: raster.rio.write_crs("EPSG:…"), or Grid(…, "EPSG:…").',
     MissingGeoreferenceError: "Give it coordinates: raster.assign_coords(x=…, y=…).",
     UnsupportedGeoreferenceError: "Give it valid coordinates, or a valid geotransform.",
 }

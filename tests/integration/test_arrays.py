@@ -373,6 +373,13 @@ def test_tie_points_as_a_table(of_files: geodelreg.Alignment) -> None:
     assert np.array_equal(table.residual_px_row, points.residual_px[:, 1], equal_nan=True)
 
 
+def test_applied_to_what_has_no_crs_the_remedy_is_that_of_arrays(
+    of_files: geodelreg.Alignment,
+) -> None:
+    with pytest.raises(MissingCrsError, match=r"rio\.write_crs"):
+        of_files.apply(plain().drop_vars("spatial_ref"))
+
+
 def test_a_plot_shows_the_kept_points_where_they_lie(of_files: geodelreg.Alignment) -> None:
     from matplotlib.figure import Figure
 

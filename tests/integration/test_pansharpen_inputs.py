@@ -114,6 +114,16 @@ def failing(files: Path) -> Any:
             ArrayShapeError,
             r"\(30, 41\).*30 rows of 40",
         ),
+        (
+            lambda files: (noise(30, 40), Grid(MS_PLACE.to_gdal(), (30, 40), UTM)),
+            TypeError,
+            "no Affine",
+        ),
+        (
+            lambda files: (noise(30, 40), Grid(MS_PLACE, (30, 40), "")),
+            MissingCrsError,
+            "EPSG",
+        ),
         (lambda files: 7, TypeError, "int is no raster"),
         (lambda files: np.zeros((3, 30, 40)), TypeError, "ndarray is no raster"),
         (lambda files: [files / "ms.tif", None], TypeError, "NoneType is no raster"),
@@ -155,6 +165,13 @@ def test_weights_and_bands_may_be_numbers(files: Path, knobs: dict[str, Any]) ->
         ({"bands": "²"}, UsageError, "are no bands"),
         ({"bands": 3}, TypeError, "bands=3"),
         ({"bit_depth": "12"}, TypeError, "bit_depth='12'"),
+        ({"bit_depth": 1.5}, TypeError, "no whole number"),
+        ({"creation_options": "COMPRESS=ZSTD"}, TypeError, "no sequence of KEY=VALUE"),
+        ({"creation_options": {"COMPRESS": "ZSTD"}}, TypeError, "no sequence of KEY=VALUE"),
+        ({"creation_options": [1]}, UsageError, "creation option 1"),
+        ({"alignment": "report.json"}, TypeError, "str is no Alignment"),
+        ({"allow": "moon"}, UsageError, "allow='moon'"),
+        ({"target": "-"}, UsageError, "standard output"),
         ({"nodata": "0"}, TypeError, "nodata='0'"),
         ({"nodata": -1.0}, UsageError, r"nodata=-1\.0.*uint16"),
         ({"resampling": "best"}, UsageError, "resampling='best'"),
@@ -165,8 +182,9 @@ def test_options_that_mean_nothing(
     files: Path, knobs: dict[str, Any], kind: type[Exception], words: str
 ) -> None:
     before = sorted(files.iterdir())
+    given = {"target": files / "sharp.tif"} | knobs
     with pytest.raises(kind, match=words):
-        geodelreg.pansharpen(files / "ms.tif", files / "pan.tif", files / "sharp.tif", **knobs)
+        geodelreg.pansharpen(files / "ms.tif", files / "pan.tif", **given)
     assert sorted(files.iterdir()) == before
 
 
