@@ -39,7 +39,7 @@ def draw_curves(rows: list[Row], path: Path) -> None:
         axes.set_yscale("symlog", linthresh=10)
         axes.axhline(5, color="0.6", lw=0.8)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[1].legend(frameon=False, fontsize=7, loc="lower right")
+    panels[1].legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     panels[0].set_title("full: as it is; dotted: aligned", fontsize=9)
     figure.savefig(path, dpi=90)
 

@@ -47,6 +47,8 @@ _TILE_PX = 1024
 """Read together: a few blocks, all bands of which stay in GDAL's cache until all are read."""
 _SAMPLE_SIDE = 300
 """Of the decimated images that the weights are fitted on: 90 000 pixels determine a few numbers."""
+_SHARE_BEFORE_COG = 0.7
+"""Of the time: the rest lays tiles and overviews out."""
 
 Progress = Callable[[float, str], None]
 
@@ -147,11 +149,21 @@ def write_pansharpened(
             draft = scratch / f"{out.name}.tif" if driver == "COG" else out
             lazy = scratch / f"{out.name}.vrt"
             with gdal_write(what.reference, target, driver):
-                _write_tiff(what, lazy, draft, grid, weights, tags, options, progress)
+                share = _SHARE_BEFORE_COG if driver == "COG" else 1.0
+
+                def tell(fraction: float, step: str) -> None:
+                    if progress is not None:
+                        progress(fraction, step)
+
+                _write_tiff(
+                    what, lazy, draft, grid, weights, tags, options, lambda f, s: tell(share * f, s)
+                )
                 if driver == "COG":
+                    tell(share, "laying out the COG")
                     creation = {"BIGTIFF": "IF_SAFER", "COMPRESS": "DEFLATE"}
                     creation |= user_creation(options)
                     rasterio.shutil.copy(draft, out, driver="COG", **creation)
+                    tell(1.0, "laying out the COG")
 
 
 def _pansharpened_xml(
@@ -276,7 +288,7 @@ def _write_tiff(
     weights: Sequence[float],
     tags: Mapping[str, str],
     options: PansharpenOptions,
-    progress: Progress | None,
+    progress: Progress,
 ) -> None:
     import rasterio
     from rasterio.windows import Window
@@ -306,8 +318,7 @@ def _write_tiff(
                 else:
                     dataset.write_mask(valid, window=window)
                 dataset.write(data, window=window)
-                if progress is not None:
-                    progress(number / len(corners), "sharpening")
+                progress(number / len(corners), "sharpening")
 
 
 def _nodata(what: Sharpening, sharp: Any, options: PansharpenOptions) -> float | None:

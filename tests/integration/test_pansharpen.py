@@ -219,6 +219,21 @@ def test_fitted_weights_keep_the_brightness_of_ms(tmp_path: Path, aligned: Path)
     assert after == pytest.approx(before, rel=0.02)
 
 
+def test_a_cog_has_overviews_and_the_same_pixels(tmp_path: Path) -> None:
+    ms, pan = ramps(tmp_path, 2, (0.0, 0.0), side=400), flat_pan(tmp_path, 800, 800)
+    told: list[tuple[float, str]] = []
+    for name, driver in (("plain.tif", "GTiff"), ("cog.tif", "COG")):
+        geodelreg.pansharpen(
+            ms, pan, tmp_path / name, driver=driver, progress=lambda *step: told.append(step)
+        )
+        assert told[-1][0] == 1.0
+    assert [fraction for fraction, _ in told[1:]] == sorted(f for f, _ in told[1:])
+    with rasterio.open(tmp_path / "plain.tif") as plain, rasterio.open(tmp_path / "cog.tif") as cog:
+        assert cog.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert cog.overviews(1)
+        assert np.array_equal(cog.read(), plain.read(), equal_nan=True)
+
+
 def test_bit_depth_clips(tmp_path: Path) -> None:
     transform = Affine(2, 0, ORIGIN[0], 0, -2, ORIGIN[1])
     ms = write(tmp_path / "ms.tif", np.full((1, 10, 10), 4000, dtype=np.uint16), transform)
