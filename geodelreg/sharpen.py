@@ -100,9 +100,7 @@ def pansharpen(
         names = [one.name for one in (*rasters, pan) if one.is_file]
         run = together([Path(target)], lambda: input_paths([*names, *masks], allow))
         stack.enter_context(run)
-        folder = stack.enter_context(scratch_folder())
-        paths = [_path(one, folder / f"ms{n}.tif") for n, one in enumerate(rasters, start=1)]
-        pan_path = _path(pan, folder / "pan.tif")
+        *paths, pan_path = _paths([*rasters, pan], stack)
         with open_raster(pan_path, allow=allow) as reader:
             check_band(reader, pan_band)
         files = [_spectral_file(path, alignment, allow) for path in paths]
@@ -138,12 +136,17 @@ def _check_lazy(target: Path, rasters: Sequence[Opened], alignment: Alignment | 
         raise UsageError(f"{target} would be a VRT, and {why}", "Name a GeoTIFF (.tif).")
 
 
-def _path(raster: Opened, scratch: Path) -> Path:
-    """The file of a raster; one is written where there is none."""
-    if raster.is_file:
-        return as_path(raster.name)
-    file_of(raster, scratch)
-    return scratch
+def _paths(rasters: Sequence[Opened], stack: ExitStack) -> list[Path]:
+    """The file of each raster, PAN last; one is written where there is none."""
+    if all(one.is_file for one in rasters):
+        return [as_path(one.name) for one in rasters]
+    folder, paths = stack.enter_context(scratch_folder()), []
+    for number, raster in enumerate(rasters, start=1):
+        name = f"ms{number}.tif" if number < len(rasters) else "pan.tif"
+        paths.append(as_path(raster.name) if raster.is_file else folder / name)
+        if not raster.is_file:
+            file_of(raster, paths[-1])
+    return paths
 
 
 def _spectral_file(path: Path, alignment: Alignment | None, allow: str) -> SpectralFile:
