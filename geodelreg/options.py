@@ -184,7 +184,7 @@ class AlignOptions:
         "refuse",
         "What to do where one affine leaves more than `max_residual_px`: refuse; warn, and write "
         "the best affine of the whole overlap all the same; or follow the bend with a field, as "
-        "auto does where `warp` can carry it.",
+        "auto does where the output can carry it.",
         ("refuse", "warn", "field"),
     )
     threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")

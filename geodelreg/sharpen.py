@@ -17,7 +17,7 @@ from geodelreg.fine.tone import robust_band_weights
 from geodelreg.geotiff.atomic import together
 from geodelreg.geotiff.rewrite import output_driver
 from geodelreg.knobs import PansharpenKnobs
-from geodelreg.options import PansharpenOptions
+from geodelreg.options import BEYOND_A_HEADER, PansharpenOptions
 from geodelreg.pair import Progress
 from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
 from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
@@ -126,14 +126,30 @@ def _check_same(alignment: Alignment, rasters: Sequence[Opened]) -> None:
         )
 
 
+def check_vrt_holds(target: Path, model: str) -> None:
+    """Refuse a VRT for a correction that no geotransform holds.
+
+    Raises
+    ------
+    UsageError
+    """
+    if model in BEYOND_A_HEADER:
+        raise UsageError(
+            f"{target} would be a VRT, and no geotransform in it holds `model={model!r}`",
+            "Name a GeoTIFF (.tif), or use another model.",
+        )
+
+
 def _check_lazy(target: Path, rasters: Sequence[Opened], alignment: Alignment | None) -> None:
     """Refuse a VRT of what it cannot name or place."""
     unnamed = [one.name for one in rasters if not one.is_file]
-    why = f"{', '.join(unnamed)} is no file that it could name" if unnamed else ""
-    if alignment is not None and not alignment.fits_a_header:
-        why = f"no geotransform in it holds the model {alignment.correction.model}"
-    if why:
-        raise UsageError(f"{target} would be a VRT, and {why}", "Name a GeoTIFF (.tif).")
+    if unnamed:
+        raise UsageError(
+            f"{target} would be a VRT, and {', '.join(unnamed)} is no file that it could name",
+            "Name a GeoTIFF (.tif).",
+        )
+    if alignment is not None:
+        check_vrt_holds(target, alignment.correction.model)
 
 
 def _paths(rasters: Sequence[Opened], stack: ExitStack) -> list[Path]:

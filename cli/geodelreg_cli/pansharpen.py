@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geodelreg.flags import as_typed
-from geodelreg.options import AlignOptions, PansharpenOptions, check_header_holds
+from geodelreg.options import AlignOptions, PansharpenOptions
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
     SectionCommand,
@@ -92,7 +92,10 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     sources, reference = ms_and_pan(rasters)
     options, align_options = build(PansharpenOptions, given), build(AlignOptions, given)
     if _is_lazy(given):
-        check_header_holds("field" if align_options.on_local == "field" else align_options.model)
+        from geodelreg.sharpen import check_vrt_holds
+
+        follows = align_options.on_local == "field"
+        check_vrt_holds(given["output"], "field" if follows else align_options.model)
     elif is_default("on_local"):
         align_options = replace(align_options, on_local="field")
     import geodelreg

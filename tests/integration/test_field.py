@@ -155,7 +155,7 @@ def test_sharpening_resamples_once_through_it(wavy: Made, tmp_path: Path) -> Non
 
 def test_a_lazy_raster_holds_none(wavy: Made, followed: Alignment, tmp_path: Path) -> None:
     out = tmp_path / "sharp.vrt"
-    with pytest.raises(UsageError, match="no geotransform in it holds the model field"):
+    with pytest.raises(UsageError, match="no geotransform in it holds `model='field'`"):
         geodelreg.pansharpen(wavy.ms, wavy.pan, out, alignment=followed)
     asked = ["pansharpen", "no.tif", "none.tif", "-o", str(out), "--model", "field"]
     assert isinstance(CliRunner().invoke(cli, asked).exception, UsageError)  # before the work

@@ -58,6 +58,7 @@ def place_array(
     return alignment.apply(ms)
 
 
-def sharpen(ms: Path, pan: Path, out: Path) -> None:
-    """Sharpen files where they lie."""
-    geodelreg.pansharpen(ms, pan, out, alignment=geodelreg.align(ms, pan), weights="equal")
+def sharpen(ms: Path | xr.DataArray, pan: Path, out: Path) -> None:
+    """Sharpen MS where it lies."""
+    weights = (0.3, 0.4, 0.2, 0.1)
+    geodelreg.pansharpen(ms, pan, out, alignment=geodelreg.align(ms, pan), weights=weights)
