@@ -101,7 +101,7 @@ class AlignOptions:
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
         "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
-        "projective one or a field, which follows what bends: `warp` does.",
+        "projective one or a field, which follows what bends: MS is then resampled.",
         MODELS,
     )
     north_up: bool = _knob(

@@ -15,12 +15,16 @@ from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
 from geodelreg.geotiff.atomic import together
-from geodelreg.geotiff.rewrite import output_driver
 from geodelreg.knobs import PansharpenKnobs
-from geodelreg.options import BEYOND_A_HEADER, PansharpenOptions
+from geodelreg.options import BEYOND_A_HEADER, AlignOptions, PansharpenOptions
 from geodelreg.pair import Progress
 from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
-from geodelreg.product.pansharpen import matched_samples, spectral_bands, write_pansharpened
+from geodelreg.product.pansharpen import (
+    matched_samples,
+    sharpened_driver,
+    spectral_bands,
+    write_pansharpened,
+)
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.product.scratch import file_of, scratch_folder
 from geodelreg.raster.inputs import AnyRaster, Opened, opened, rasters_of
@@ -95,18 +99,13 @@ def pansharpen(
         pan = opened(reference, stack, allow)
         if alignment is not None:
             _check_same(alignment, rasters)
-        if output_driver(Path(target), options.driver) == "VRT":
+        if sharpened_driver(Path(target), options) == "VRT":
             _check_lazy(Path(target), [*rasters, pan], alignment)
         names = [one.name for one in (*rasters, pan) if one.is_file]
         run = together([Path(target)], lambda: input_paths([*names, *masks], allow))
         stack.enter_context(run)
         *paths, pan_path = _paths([*rasters, pan], stack)
-        with open_raster(pan_path, allow=allow) as reader:
-            check_band(reader, pan_band)
-        files = [_spectral_file(path, alignment, allow) for path in paths]
-        bands = spectral_bands(files, options.given_bands())
-        what = Sharpening(files, pan_path, pan_band, bands)
-        check_finer(what)
+        what = _sharpening(paths, pan_path, pan_band, options, alignment, allow)
         weights = _weights(what, options)
         tags = {} if alignment is None else provenance_tags(alignment)
         write_pansharpened(what, Path(target), weights, tags, options, progress)
@@ -126,13 +125,53 @@ def _check_same(alignment: Alignment, rasters: Sequence[Opened]) -> None:
         )
 
 
-def check_vrt_holds(target: Path, model: str) -> None:
-    """Refuse a VRT for a correction that no geotransform holds.
+def check_sharpenable(
+    sources: Sequence[str],
+    reference: str,
+    target: Path,
+    options: PansharpenOptions,
+    align: AlignOptions,
+) -> None:
+    """Refuse files that could not be sharpened so, before they are aligned.
 
     Raises
     ------
-    UsageError
+    UsageError, BandNumberError, GeodelregError
     """
+    if sharpened_driver(target, options) == "VRT":
+        _check_vrt_holds(target, "field" if align.on_local == "field" else align.model)
+    paths, pan_path = [as_path(source) for source in sources], as_path(reference)
+    with allowing(align.allow):
+        _sharpening(paths, pan_path, align.pan_band, options, None, align.allow)
+
+
+def _sharpening(
+    paths: Sequence[Path],
+    pan_path: Path,
+    pan_band: int,
+    options: PansharpenOptions,
+    alignment: Alignment | None,
+    allow: str,
+) -> Sharpening:
+    with open_raster(pan_path, allow=allow) as reader:
+        check_band(reader, pan_band)
+    files = [_spectral_file(path, alignment, allow) for path in paths]
+    bands = spectral_bands(files, options.given_bands())
+    what = Sharpening(files, pan_path, pan_band, bands)
+    check_finer(what)
+    if options.weights not in ("auto", "equal"):
+        given = options.given_weights()
+        if len(given) != len(bands):
+            raise UsageError(
+                f"`weights={options.weights!r}` are {len(given)}, and {len(bands)} bands are "
+                "sharpened",
+                "Give one weight to each band, or use auto.",
+            )
+    return what
+
+
+def _check_vrt_holds(target: Path, model: str) -> None:
+    """Refuse a VRT for a correction that no geotransform holds."""
     if model in BEYOND_A_HEADER:
         raise UsageError(
             f"{target} would be a VRT, and no geotransform in it holds `model={model!r}`",
@@ -149,7 +188,7 @@ def _check_lazy(target: Path, rasters: Sequence[Opened], alignment: Alignment | 
             "Name a GeoTIFF (.tif).",
         )
     if alignment is not None:
-        check_vrt_holds(target, alignment.correction.model)
+        _check_vrt_holds(target, alignment.correction.model)
 
 
 def _paths(rasters: Sequence[Opened], stack: ExitStack) -> list[Path]:
@@ -180,13 +219,7 @@ def _weights(what: Sharpening, options: PansharpenOptions) -> list[float]:
     """Weights of the spectral bands; fitted ones are scaled so that the values of MS are kept."""
     count = len(what.bands)
     if options.weights not in ("auto", "equal"):
-        given = options.given_weights()
-        if len(given) != count:
-            raise UsageError(
-                f"`weights={options.weights!r}` are {len(given)}, and {count} bands are sharpened",
-                "Give one weight to each band, or use auto.",
-            )
-        return list(given)
+        return list(options.given_weights())
     if options.weights == "equal":
         return [1.0 / count] * count
     bands, pan = matched_samples(what)

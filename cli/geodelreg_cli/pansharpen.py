@@ -91,18 +91,16 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     start_run(given)
     sources, reference = ms_and_pan(rasters)
     options, align_options = build(PansharpenOptions, given), build(AlignOptions, given)
-    if _is_lazy(given):
-        from geodelreg.sharpen import check_vrt_holds
-
-        follows = align_options.on_local == "field"
-        check_vrt_holds(given["output"], "field" if follows else align_options.model)
-    elif is_default("on_local"):
+    if is_default("on_local") and not _is_lazy(given):
         align_options = replace(align_options, on_local="field")
     import geodelreg
     from geodelreg.pair import part_of
+    from geodelreg.sharpen import check_sharpenable
     from geodelreg_cli.outputs import check_targets
 
     check_targets([*sources, reference], [given["output"]], options.overwrite)
+    if not given["no_align"]:
+        check_sharpenable(sources, reference, given["output"], options, align_options)
     source = sources[0] if len(sources) == 1 else sources
     alignment: Alignment | None = None
     with progress_bar(given["quiet"]) as bar:

@@ -73,6 +73,22 @@ def spectral_bands(files: Sequence[SpectralFile], chosen: Sequence[int]) -> list
     return [found[number - 1] for number in chosen] if chosen else found
 
 
+def sharpened_driver(target: Path, options: PansharpenOptions) -> str:
+    """GDAL driver of a sharpened raster.
+
+    Raises
+    ------
+    UsageError, GeodelregError
+        There is none.
+    """
+    driver = output_driver(target, options.driver)
+    if driver not in ("GTiff", "COG", "VRT"):
+        raise UsageError(
+            f"`driver={driver!r}` is no format of sharpened rasters", "Use GTiff, COG or VRT."
+        )
+    return driver
+
+
 def matched_samples(what: Sharpening) -> tuple[Float32Array, Float32Array]:
     """Spectral bands and PAN averaged to the same pixels, some 300 × 300, for fitting weights.
 
@@ -131,12 +147,7 @@ def write_pansharpened(
     import rasterio
 
     with gdal_session(what.reference):
-        driver = output_driver(target, options.driver)
-        if driver not in ("GTiff", "COG", "VRT"):
-            raise UsageError(
-                f"`driver={driver!r}` is no format of sharpened rasters",
-                "Use GTiff, COG or VRT.",
-            )
+        driver = sharpened_driver(target, options)
         with open_raster(what.reference) as pan:
             grid = target_grid(what, pan, options.extent)
         stale = sidecars.stale_beside(Path(os.path.realpath(target)), what.sources[0].path)

@@ -46,9 +46,14 @@ def test_what_is_not_supported_is_refused(geodelreg: Command, pair: Path) -> Non
         (("--bands", "0"), "--bands 0 are no bands"),
         (("--bit-depth", "99"), "--bit-depth 99"),
         (("--extent", "moon"), "'moon' is not one of"),
+        (("--weights", "1,2"), "--weights 1,2 are 2, and 4 bands"),
+        (("--bands", "9"), "--bands 9 are not all among the 4 bands"),
+        (("--of", "PNG"), "--of PNG is no format"),
+        (("--pan-band", "2"), "has no band 2"),
     ],
 )
 def test_wrong_usage(geodelreg: Command, pair: Path, args: tuple[str, ...], message: str) -> None:
+    write_noise(pair / "ms.tif", pair / "ms.tif", 5)  # to be refused if it came to that
     before = snapshot(pair)
     done = geodelreg(*PANSHARPEN, "sharp.tif", *args, cwd=pair)
     assert done.returncode == 2
