@@ -5,14 +5,19 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from numbers import Integral, Real
 from typing import Any
 
 from geodelreg.errors import UsageError
-from geodelreg.masking import parse_mask
+from geodelreg.option_checks import (
+    check_choice,
+    check_creation,
+    check_masks,
+    check_number,
+    check_range,
+    keep_list,
+)
 
 METHODS = ("delaunay", "zhang2013", "sift")
 MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective", "field")
@@ -34,57 +39,6 @@ def _knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
 def knob_help(options: type, name: str) -> str:
     """Help text of one knob of an options class."""
     return str({f.name: f for f in fields(options)}[name].metadata["help"])
-
-
-def _check_choice(options: object, name: str) -> None:
-    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
-    choices, value = spec.metadata["choices"], getattr(options, name)
-    if value not in choices:
-        raise UsageError(f"`{name}={value!r}` is unknown", f"Use one of: {', '.join(choices)}.")
-
-
-def _check_masks(options: object, name: str) -> None:
-    """Check the names of masks, and make paths of any kind strings."""
-    value = getattr(options, name)
-    if isinstance(value, str | os.PathLike):
-        raise UsageError(f"`{name}={value!r}` is one name", "Give a tuple of them.")
-    masks = tuple(os.fspath(mask) for mask in value)
-    for mask in masks:
-        parse_mask(mask)
-    object.__setattr__(options, name, masks)
-
-
-def _check_creation(options: WriteOptions | PansharpenOptions) -> None:
-    given = options.creation_options
-    if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
-        raise TypeError(f"`creation_options={given!r}` is no sequence of KEY=VALUE")
-    for option in given:
-        if not isinstance(option, str) or "=" not in option:
-            raise UsageError(f"creation option {option!r} is not KEY=VALUE")
-
-
-def _check_number(options: object, name: str) -> None:
-    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
-    value, is_whole = getattr(options, name), str(spec.type).startswith("int")
-    if value is not None and not isinstance(value, Integral if is_whole else Real):
-        raise TypeError(f"`{name}={value!r}` is no {'whole ' if is_whole else ''}number")
-
-
-def _keep_list(options: object, name: str) -> None:
-    """Keep a sequence of numbers as a tuple; on the command line it is text."""
-    value = getattr(options, name)
-    if not isinstance(value, str):
-        try:
-            object.__setattr__(options, name, tuple(value))
-        except TypeError:
-            raise TypeError(f"`{name}={value!r}` is neither text nor numbers") from None
-
-
-def _check_range(options: object, name: str, low: float, high: float) -> None:
-    _check_number(options, name)
-    value = getattr(options, name)
-    if value is not None and not low <= value <= high:
-        raise UsageError(f"`{name}={value}` is out of range", f"Use {low:g} to {high:g}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,35 +153,35 @@ class AlignOptions:
     seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
 
     def __post_init__(self) -> None:
-        _check_choice(self, "method")
-        _check_choice(self, "model")
-        _check_choice(self, "search")
-        _check_choice(self, "allow")
-        _check_choice(self, "band_model")
-        _check_range(self, "band", 1, 65535)
+        check_choice(self, "method")
+        check_choice(self, "model")
+        check_choice(self, "search")
+        check_choice(self, "allow")
+        check_choice(self, "band_model")
+        check_range(self, "band", 1, 65535)
         if self.per_band and (self.band or self.method != "delaunay"):
             raise UsageError(
                 "`per_band=True` matches each band, by `method='delaunay'`",
                 "Drop `band`, and use that method.",
             )
-        _check_range(self, "pan_band", 1, 65535)
-        _check_masks(self, "masks")
-        _check_masks(self, "pan_masks")
-        _check_range(self, "search_radius_px", 0, 1e7)
-        _check_range(self, "tolerance_px", 0, 1e3)
-        _check_range(self, "ratio", 0.1, 1.0)
-        _check_range(self, "max_keypoints", 16, 100_000)
-        _check_range(self, "max_shift_px", 0, 1e9)
-        _check_range(self, "max_rotation_deg", 0, 180)
-        _check_range(self, "max_scale", 1, 1e3)
-        _check_range(self, "max_residual_px", 0, 1e6)
-        _check_choice(self, "on_local")
+        check_range(self, "pan_band", 1, 65535)
+        check_masks(self, "masks")
+        check_masks(self, "pan_masks")
+        check_range(self, "search_radius_px", 0, 1e7)
+        check_range(self, "tolerance_px", 0, 1e3)
+        check_range(self, "ratio", 0.1, 1.0)
+        check_range(self, "max_keypoints", 16, 100_000)
+        check_range(self, "max_shift_px", 0, 1e9)
+        check_range(self, "max_rotation_deg", 0, 180)
+        check_range(self, "max_scale", 1, 1e3)
+        check_range(self, "max_residual_px", 0, 1e6)
+        check_choice(self, "on_local")
         if self.north_up and self.model not in ("auto", "shift", "scale"):
             raise UsageError(
                 f"`north_up=True` and `model={self.model!r}` exclude each other",
                 "Use auto, shift or scale.",
             )
-        _check_range(self, "threads", 0, 1024)
+        check_range(self, "threads", 0, 1024)
         if self.model == "field" and self.method != "delaunay":
             raise UsageError(
                 f"`method={self.method!r}` knows no field",
@@ -285,10 +239,10 @@ class WriteOptions:
     )
 
     def __post_init__(self) -> None:
-        _check_choice(self, "georef")
-        _check_choice(self, "warp_grid")
-        _check_choice(self, "resampling")
-        _check_creation(self)
+        check_choice(self, "georef")
+        check_choice(self, "warp_grid")
+        check_choice(self, "resampling")
+        check_creation(self, "creation_options")
         if self.warp and self.georef == "gcps":
             raise UsageError(
                 "`warp=True` and `georef='gcps'` exclude each other", "Drop one of them."
@@ -326,10 +280,10 @@ class BatchOptions:
     )
 
     def __post_init__(self) -> None:
-        _check_range(self, "limit_px", 0, 1e6)
-        _check_range(self, "workers", 0, 100_000)
-        _check_range(self, "timeout_s", 1e-3, 1e9)
-        _check_range(self, "memory_mb", 1, 1e9)
+        check_range(self, "limit_px", 0, 1e6)
+        check_range(self, "workers", 0, 100_000)
+        check_range(self, "timeout_s", 1e-3, 1e9)
+        check_range(self, "memory_mb", 1, 1e9)
         if self.check and self.in_place:
             raise UsageError(
                 "`check=True` and `in_place=True` exclude each other", "Drop one of them."
@@ -369,13 +323,13 @@ class PansharpenOptions:
     )
 
     def __post_init__(self) -> None:
-        _check_choice(self, "resampling")
-        _check_choice(self, "extent")
-        _check_range(self, "bit_depth", 1, 32)
-        _check_number(self, "nodata")
-        _keep_list(self, "weights")
-        _keep_list(self, "bands")
-        _check_creation(self)
+        check_choice(self, "resampling")
+        check_choice(self, "extent")
+        check_range(self, "bit_depth", 1, 32)
+        check_number(self, "nodata")
+        keep_list(self, "weights")
+        keep_list(self, "bands")
+        check_creation(self, "creation_options")
         if self.weights not in ("auto", "equal"):
             self.given_weights()
         self.given_bands()

@@ -1,0 +1,70 @@
+"""What the values of options may be, asked when they are made; each refusal names the knob.
+
+The functions take the options and the name of the field, and raise `UsageError` for impossible
+values, `TypeError` for those of another type.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from numbers import Integral, Real
+
+from geodelreg.errors import UsageError
+from geodelreg.masking import parse_mask
+
+
+def check_choice(options: object, name: str) -> None:
+    """Take only what the field lists."""
+    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    choices, value = spec.metadata["choices"], getattr(options, name)
+    if value not in choices:
+        raise UsageError(f"`{name}={value!r}` is unknown", f"Use one of: {', '.join(choices)}.")
+
+
+def check_masks(options: object, name: str) -> None:
+    """Check the names of masks, and make paths of any kind strings."""
+    value = getattr(options, name)
+    if isinstance(value, str | os.PathLike):
+        raise UsageError(f"`{name}={value!r}` is one name", "Give a tuple of them.")
+    masks = tuple(os.fspath(mask) for mask in value)
+    for mask in masks:
+        parse_mask(mask)
+    object.__setattr__(options, name, masks)
+
+
+def check_creation(options: object, name: str) -> None:
+    """Take only a sequence of ``KEY=VALUE``."""
+    given = getattr(options, name)
+    if isinstance(given, str | Mapping) or not isinstance(given, Iterable):
+        raise TypeError(f"`{name}={given!r}` is no sequence of KEY=VALUE")
+    for option in given:
+        if not isinstance(option, str) or "=" not in option:
+            raise UsageError(f"creation option {option!r} is not KEY=VALUE")
+
+
+def check_number(options: object, name: str) -> None:
+    """Take only numbers, and whole ones for fields of these."""
+    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    value, is_whole = getattr(options, name), str(spec.type).startswith("int")
+    if value is not None and not isinstance(value, Integral if is_whole else Real):
+        raise TypeError(f"`{name}={value!r}` is no {'whole ' if is_whole else ''}number")
+
+
+def keep_list(options: object, name: str) -> None:
+    """Keep a sequence of numbers as a tuple; on the command line it is text."""
+    value = getattr(options, name)
+    if not isinstance(value, str):
+        try:
+            object.__setattr__(options, name, tuple(value))
+        except TypeError:
+            raise TypeError(f"`{name}={value!r}` is neither text nor numbers") from None
+
+
+def check_range(options: object, name: str, low: float, high: float) -> None:
+    """Take only numbers from `low` to `high`, both included."""
+    check_number(options, name)
+    value = getattr(options, name)
+    if value is not None and not low <= value <= high:
+        raise UsageError(f"`{name}={value}` is out of range", f"Use {low:g} to {high:g}.")
