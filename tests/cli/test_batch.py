@@ -341,7 +341,7 @@ def test_warnings_are_kept_for_every_pair(folder: Path, geodelreg: Command) -> N
     done = geodelreg("batch", manifest, "-q")
     assert done.returncode == 0, done.stderr
     (row,) = read_table(folder / "pairs.results.csv", without=TIMINGS)
-    assert "--strip-rpc drops them" in row["warnings"]
+    assert "`strip_rpc=True` drops them" in row["warnings"]
 
 
 def test_a_footprint_across_the_antimeridian_is_cut_there(folder: Path, geodelreg: Command) -> None:
