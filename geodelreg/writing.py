@@ -65,6 +65,7 @@ def write(
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
+    from geodelreg.writing_bands import placed_bands
 
     check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
@@ -177,39 +178,6 @@ def placement_of(alignment: Alignment, correction: Correction) -> PixelMap | Non
     return to_shared.then(shared).then(AffineMap(~to_shared.affine))
 
 
-def placed_bands(alignment: Alignment, path: Path, correction: Correction) -> dict[int, PixelMap]:
-    """Bands of an MS file, by their numbers there, that have a place of their own.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    path : Path
-        Of the file.
-    correction : Correction
-        Of the file, by `correction_of_file`.
-
-    Returns
-    -------
-    dict of int to PixelMap
-        Pixels of the file to those of its header.
-    """
-    from geodelreg.geo.maps.affine import AffineMap
-
-    bands = alignment.solution.bands
-    if not bands or alignment.verdict.outcome is not Outcome.ALIGNED:
-        return {}
-    with open_raster(alignment.source.paths, allow=alignment.options.allow) as reader:
-        stored = reader.stored
-    to_shared = AffineMap(~alignment.source.grid.transform @ correction.original)
-    found: dict[int, PixelMap] = {}
-    for band in bands:
-        file, number = stored[band.number - 1]
-        if Path(file) == path:
-            back = AffineMap(~to_shared.affine)
-            found[number] = to_shared.then(band.map).then(back)
-    return found
-
-
 def revert(*paths: AnyPath) -> None:
     """Take back what `write_in_place` did: the files are bit by bit what they were.
 
@@ -229,6 +197,8 @@ def export_gcps(
     path: AnyPath,
     format: str | None = None,  # noqa: A002 - the field's word
     overwrite: bool = False,
+    *,
+    points: str = "kept",
 ) -> None:
     """Write the kept tie points as ground control points of the MS raster.
 
@@ -240,18 +210,24 @@ def export_gcps(
     format : str, optional
         One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
     overwrite : bool
+    points : str
+        ``kept``, or ``all`` with the rejected ones: as points that QGIS does not enable, or GeoJSON
+        with status (0 = kept), residual, standard error and correlation as numbers.
 
     Raises
     ------
     GcpFormatError
-        If the format is not known.
+        If the format is not known, or has no room for rejected points.
     OutputExistsError, OutputIsInputError, OutputUnwritableError
     """
     from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 
     check_accepted(alignment)
-    gcps, context = gcps_from_alignment(alignment), gcp_context(alignment)
+    if points not in ("kept", "all"):
+        raise UsageError(f"`points={points!r}` is unknown", "Use one of: kept, all.")
+    every = points == "all"
+    gcps, context = gcps_from_alignment(alignment, every), gcp_context(alignment, every)
     with together(inputs=lambda: inputs_of(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 

@@ -9,7 +9,9 @@ from geodelreg.door.names import as_path
 from geodelreg.errors import UsageError
 from geodelreg.options import WriteOptions, check_header_holds
 from geodelreg.product.provenance import provenance_tags
-from geodelreg.values.result import Alignment, Correction
+from geodelreg.raster.reader import open_raster
+from geodelreg.values.maps import PixelMap
+from geodelreg.values.result import Alignment, Correction, Outcome
 
 
 def bands_target(target: Path, sources: int) -> bool:
@@ -88,11 +90,42 @@ def _geotransforms(
     alignment: Alignment, path: Path, correction: Correction
 ) -> dict[int, Correction]:
     """Correction of each band of a file that has one of its own."""
-    from geodelreg.writing import placed_bands
-
     found = {}
     for number, placed in placed_bands(alignment, path, correction).items():
         affine = placed.as_affine()
         assert affine is not None
         found[number] = replace(correction, corrected=correction.original @ affine)
+    return found
+
+
+def placed_bands(alignment: Alignment, path: Path, correction: Correction) -> dict[int, PixelMap]:
+    """Bands of an MS file, by their numbers there, that have a place of their own.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    path : Path
+        Of the file.
+    correction : Correction
+        Of the file, by `correction_of_file`.
+
+    Returns
+    -------
+    dict of int to PixelMap
+        Pixels of the file to those of its header.
+    """
+    from geodelreg.geo.maps.affine import AffineMap
+
+    bands = alignment.solution.bands
+    if not bands or alignment.verdict.outcome is not Outcome.ALIGNED:
+        return {}
+    with open_raster(alignment.source.paths, allow=alignment.options.allow) as reader:
+        stored = reader.stored
+    to_shared = AffineMap(~alignment.source.grid.transform @ correction.original)
+    found: dict[int, PixelMap] = {}
+    for band in bands:
+        file, number = stored[band.number - 1]
+        if Path(file) == path:
+            back = AffineMap(~to_shared.affine)
+            found[number] = to_shared.then(band.map).then(back)
     return found

@@ -14,7 +14,7 @@ from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.flags import as_typed
 from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
-from geodelreg_cli.console import log_steps, progress_bar
+from geodelreg_cli.console import log_steps, log_timings, progress_bar
 from geodelreg_cli.figure import kind_option
 from geodelreg_cli.options import (
     GCP_FORMAT,
@@ -81,6 +81,7 @@ class Request:
     dry_run: bool
     gcps: tuple[Path, ...]
     gcp_format: str | None
+    points: str
     reports: tuple[Path, ...]
     displacement: Path | None
     figure: Path | None
@@ -132,6 +133,14 @@ def align_params() -> list[SectionOption]:
             type=GCP_FORMAT,
             section=OUTPUT,
             help="Format of --gcps, when the extension does not say it.",
+        ),
+        flag(
+            "--points",
+            type=click.Choice(("kept", "all")),
+            default="kept",
+            show_default=True,
+            section=OUTPUT,
+            help="Tie points in --gcps; all has the rejected ones, too (QGIS, GeoJSON).",
         ),
         flag(
             "--report",
@@ -215,6 +224,7 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
         dry_run=given["dry_run"],
         gcps=given["gcps"],
         gcp_format=given["gcp_format"],
+        points=given["points"],
         reports=given["report"],
         displacement=given["displacement"],
         figure=given["figure"],
@@ -302,7 +312,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
             with together(inputs=lambda: inputs):
                 _draw(refusal.alignment, request)
                 _write_texts(_reports(refusal.alignment, request), request)
-            _log_timings(refusal.alignment)
+            log_timings(refusal.alignment)
             if not request.quiet:
                 click.echo(_step_counts(refusal.alignment), err=True)
         raise
@@ -311,7 +321,7 @@ def _run(request: Request, inputs: Sequence[Path]) -> None:
         _draw(alignment, request)
         _write(alignment, request)
         _write_texts(reports, request)
-    _log_timings(alignment)
+    log_timings(alignment)
     if not request.quiet:
         click.echo(shown(_named(request)), err=True)
         click.echo(as_typed(summary_text(alignment, request.write_options)), err=True)
@@ -336,16 +346,6 @@ def _written(request: Request) -> str:
     return f"Written: {names}" if names else "Written: nothing (dry run)"
 
 
-def _log_timings(alignment: Alignment) -> None:
-    """Where the time went, and what did the work, for -v."""
-    log = logging.getLogger(__name__)
-    timings = (f"{step} {seconds:.2f}" for step, seconds in alignment.timings_s.items())
-    log.info("seconds: %s", ", ".join(timings))
-    log.info("versions: %s", ", ".join(f"{n} {v}" for n, v in alignment.versions.items()))
-    if alignment.crs_operation:
-        log.info("coordinates: %s", alignment.crs_operation)
-
-
 def _step_counts(alignment: Alignment) -> str:
     """Points that survive each step, as in the paper's "112 → 97 → 91"."""
     counts = alignment.solution.step_counts.items()
@@ -367,7 +367,7 @@ def _write(alignment: Alignment, request: Request) -> None:
     if request.displacement is not None:
         geodelreg.write_displacement(alignment, request.displacement, overwrite)
     for path in request.gcps:
-        geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite=overwrite)
+        geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite, points=request.points)
 
 
 def _draw(alignment: Alignment, request: Request) -> None:

@@ -7,12 +7,15 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from geodelreg.errors import shown
 from geodelreg.flags import as_typed
+
+if TYPE_CHECKING:
+    from geodelreg.values.result import Alignment
 
 Progress = Callable[[float, str], None]
 
@@ -102,3 +105,13 @@ def progress_bar(quiet: bool) -> Iterator[Progress | None]:
             bar.update(task, completed=fraction, description=shown(text))
 
         yield show
+
+
+def log_timings(alignment: Alignment) -> None:
+    """Where the time went, and what did the work, for -v."""
+    log = logging.getLogger(__name__)
+    timings = (f"{step} {seconds:.2f}" for step, seconds in alignment.timings_s.items())
+    log.info("seconds: %s", ", ".join(timings))
+    log.info("versions: %s", ", ".join(f"{n} {v}" for n, v in alignment.versions.items()))
+    if alignment.crs_operation:
+        log.info("coordinates: %s", alignment.crs_operation)

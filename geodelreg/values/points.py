@@ -147,7 +147,10 @@ NO_TIE_POINTS = TiePoints(
 
 @dataclass(frozen=True, slots=True)
 class Gcp:
-    """A ground control point: MS pixel (outer corner) ↔ map coordinates in the MS CRS."""
+    """A ground control point: MS pixel (outer corner) ↔ map coordinates in the MS CRS.
+
+    `facts` are its numbers by name, for formats that have fields; a rejected one is not `enabled`.
+    """
 
     id: str
     column: float
@@ -156,6 +159,8 @@ class Gcp:
     y: float
     z: float = 0.0
     info: str = ""
+    enabled: bool = True
+    facts: tuple[tuple[str, float | None], ...] = ()
 
 
 def _nowhere() -> FloatArray:

@@ -70,12 +70,17 @@ GCP_FORMATS = {
 }
 
 
-def gcps_from_alignment(alignment: Alignment) -> tuple[Gcp, ...]:
+_WITH_REJECTED = ("qgis", "geojson")
+
+
+def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp, ...]:
     """Ground control points of the kept tie points, by MS row, then column.
 
     Parameters
     ----------
     alignment : Alignment
+    every : bool
+        Those of the rejected tie points, too, with what is known of each.
 
     Returns
     -------
@@ -89,18 +94,41 @@ def gcps_from_alignment(alignment: Alignment) -> tuple[Gcp, ...]:
         If the two CRSs are not connected.
     """
     points, reference = alignment.tie_points, alignment.reference.grid
-    order = reading_order(points)
+    order = reading_order(points, every)
     ground = map_points(
         apply_affine(reference.transform, points.reference_px[order]),
         reference.crs_wkt,
         alignment.source.grid.crs_wkt,
     )
     return tuple(
-        Gcp(str(number), column, row, x, y, info=_info(points, int(index)))
+        Gcp(
+            str(number),
+            column,
+            row,
+            x,
+            y,
+            info=_info(points, int(index)),
+            enabled=bool(points.kept[index]),
+            facts=_facts(points, int(index)) if every else (),
+        )
         for number, (index, (column, row), (x, y)) in enumerate(
             zip(order, points.source_px[order].tolist(), ground.tolist(), strict=True), start=1
         )
     )
+
+
+def _facts(points: TiePoints, index: int) -> tuple[tuple[str, float | None], ...]:
+    """Numbers of one tie point, ``_px`` in PAN pixels; None where one is not known."""
+    (right, down), (across, along) = points.residual_px[index], points.sigma_px[index]
+    numbers = {
+        "residual_right_px": right,
+        "residual_down_px": down,
+        "sigma_right_px": across,
+        "sigma_down_px": along,
+        "correlation": points.score[index],
+    }
+    known = {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
+    return ("status", float(points.status[index])), *known.items()
 
 
 def _info(points: TiePoints, index: int) -> str:
@@ -145,7 +173,13 @@ def write_gcps(
         As `write_text_atomically` raises them.
     """
     target = Path(path)
-    chosen = _format(format or _format_by_extension(target))
+    name = format or _format_by_extension(target)
+    chosen = _format(name)
+    if name not in _WITH_REJECTED and not all(gcp.enabled for gcp in gcps):
+        raise GcpFormatError(
+            f"{target}: the format {name} cannot say which points were rejected",
+            "Use QGIS points or GeoJSON, or leave the rejected ones out (`points='kept'`).",
+        )
     for gcp in gcps:
         if not all(map(math.isfinite, (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z))):
             raise GcpFormatError(

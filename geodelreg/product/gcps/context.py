@@ -62,14 +62,15 @@ Encoder = Callable[[Sequence[Gcp], GcpContext, Path], str]
 Decoder = Callable[[str, GcpContext | None], Decoded]
 
 
-def reading_order(tie_points: TiePoints) -> IntArray:
-    """Indices (K,) of the kept tie points, by MS row, then column."""
-    kept = np.flatnonzero(tie_points.kept)
+def reading_order(tie_points: TiePoints, every: bool = False) -> IntArray:
+    """Indices (K,) of the kept tie points, by MS row, then column; of all that lie anywhere."""
+    known = np.isfinite(np.hstack([tie_points.source_px, tie_points.reference_px])).all(axis=1)
+    kept = np.flatnonzero(known if every else tie_points.kept)
     columns, rows = tie_points.source_px[kept].T
     return kept[np.lexsort((columns, rows))]
 
 
-def gcp_context(alignment: Alignment) -> GcpContext:
+def gcp_context(alignment: Alignment, every: bool = False) -> GcpContext:
     """Context of `gcps_from_alignment`'s points, in the same order."""
     points = alignment.tie_points
     return GcpContext(
@@ -78,7 +79,7 @@ def gcp_context(alignment: Alignment) -> GcpContext:
         reference=alignment.reference.grid,
         source_paths=alignment.source.paths,
         reference_path=alignment.reference.paths[0],
-        reference_px=points.reference_px[reading_order(points)],
+        reference_px=points.reference_px[reading_order(points, every)],
     )
 
 

@@ -68,6 +68,7 @@ def _feature(gcp: Gcp, longitude: float, latitude: float, crs: str) -> dict[str,
             "y": gcp.y,
             "z": gcp.z,
             "crs": crs,
+            **dict(gcp.facts),
         },
     }
 
@@ -81,6 +82,7 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
         If the text is no such GeoJSON or its features disagree on the CRS.
     """
     properties = [_properties(feature) for feature in _features(text)]
+    properties = [item for item in properties if not item.get("status")]  # 0 is kept
     names = {str(item["crs"]) for item in properties if item.get("crs")}
     if len(names) > 1:
         raise GcpFormatError("the features have different CRSs")

@@ -42,7 +42,7 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
     ):
         values = (gcp.x, gcp.y, x, y)
         residual = (round(value, 6) + 0.0 for value in (dx, dy, math.hypot(dx, dy)))
-        lines.append(",".join([*map(exact, values), "1", *map(exact, residual)]))
+        lines.append(",".join([*map(exact, values), "01"[gcp.enabled], *map(exact, residual)]))
     return "\n".join(lines) + "\n"
 
 
