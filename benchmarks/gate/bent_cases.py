@@ -225,9 +225,9 @@ def _apart(spec: SceneSpec, imagery: Imagery, rng: np.random.Generator) -> BentP
 def _framed_strangers(
     case: BentCase, spec: SceneSpec, imagery: Imagery, rng: np.random.Generator
 ) -> BentPair:
-    """Two places that share nothing but a frame."""
+    """Two places that share nothing but a frame: the one mirrored, for no rotation undoes that."""
     scene = make_scene(spec, imagery)
-    mirrored = replace(imagery, bands=np.ascontiguousarray(imagery.bands[:, ::-1, ::-1]))
+    mirrored = replace(imagery, bands=np.ascontiguousarray(imagery.bands[:, :, ::-1]))
     scene = replace(scene, pan=make_scene(spec, mirrored).pan)
     frame((scene.ms, scene.pan), case.kind.split(", ")[1], rng)
     return BentPair(scene, same_ground=False)

@@ -15,10 +15,12 @@ from geodelreg.fine.surface import Surface, make_surface
 from geodelreg.fine.tiles import dark_tile, overview_tile
 from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
+from geodelreg.fit.models import PARAMETER_COUNT
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
 from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
 from geodelreg.judge.in_place import area_evidence
+from geodelreg.judge.repeated import proof_without_repeated
 from geodelreg.judge.rival import Rival, rival_correlation
 from geodelreg.judge.verdict import Evidence
 from geodelreg.judge.words import BANDS_TOLD_PX
@@ -61,6 +63,9 @@ def gather(
         bands = find_bands(guess, refined, correction, pool)
         apart = bands_apart(bands, pair)
         told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
+        model = fitted.selection.estimate.model
+        size = PARAMETER_COUNT.get(model, PARAMETER_COUNT["affine"]) // 2  # a field's trend is one
+        repeated = pool.submit(proof_without_repeated, refined, correction, size)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)
@@ -75,6 +80,8 @@ def gather(
         disagreement_px=fitted.disagreement_px,
         rival=rival.elsewhere,
         shading=rival.beside,
+        repeated=repeated.result().log_chance,
+        repeated_words=repeated.result().words,
         shift_px=float(np.hypot(*pair.move_px(correction, pair.source_centre)[0])),
         rotation_deg=abs(turn_deg),
         scale=scale,

@@ -17,11 +17,13 @@ from geodelreg.values.result import Outcome, Reason, Verdict
 
 MIN_POINTS = 8  # unexplained: ablate
 _MAX_LOG_EACH = -2.0  # one alarm in a hundred
+_MAX_LOG_TOGETHER = -8.0  # one alarm in 10 000 by each of two that look at different things
+_OFF_WHAT_IS_DRAWN = "log10 of the chance of both, off what is drawn on both images"
 _LIMITS = (
     ("tie_points", "≥", MIN_POINTS, "tie points agree"),
     ("log_nfa", "≤", _MAX_LOG_EACH, "log10 of the expected chance agreements"),
     ("log_chance", "≤", _MAX_LOG_EACH, "log10 of the chance that unrelated areas correlate so"),
-    ("log_together", "≤", -8.0, "log10 of the chance of both, positions and likeness"),
+    ("log_together", "≤", _MAX_LOG_TOGETHER, "log10 of the chance of both, positions and likeness"),
     ("coverage", "≥", 0.05, "share of the overlap covered"),
     ("sigma_px", "≤", 0.7, "PAN px standard error at the worst corner"),
     ("disagreement_px", "≤", 1.0, "PAN px between the correction and"),
@@ -94,6 +96,11 @@ class Evidence:
         Which bands, and how they lie.
     strain : float
         Largest of a field, at its points and over the raster; 0 of what is none.
+    repeated : float or None
+        `log_nfa` and `log_chance` together, off structure of the pixel grid that both images
+        repeat; None where there is none.
+    repeated_words : str
+        The values that it is drawn with.
     """
 
     points: int
@@ -117,6 +124,8 @@ class Evidence:
     bands: float = 0.0
     bands_words: str = ""
     strain: float = 0.0
+    repeated: float | None = None
+    repeated_words: str = ""
 
 
 def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
@@ -136,7 +145,9 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     which = f": {evidence.bands_words}" if evidence.bands_words else ""
     most_px = options.max_residual_px if options.on_local == "refuse" else None
     strained = MOST_STRAIN if evidence.strain else None
+    repeated = _MAX_LOG_TOGETHER if evidence.repeated is not None else None
     whole = (
+        ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
         ("bands", "≤", MAX_BANDS_PX, f"PAN px at least between the places of two MS bands{which}"),
         ("strain", "≤", strained, "strain of the field, which so steep would fold the ground"),
         ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),

@@ -75,6 +75,10 @@ REASONS = {
         "Lit alike",
         "Likeness of opposite contrast close beside the place, on one side alone.",
     ),
+    "repeated": (
+        "True of the ground alone",
+        "Positions and likeness without labels, collars and what else is drawn on both images.",
+    ),
     "rival_motion": (
         "No rival motion",
         "Patches that agree on another motion, for each that agrees on this one.",
@@ -114,6 +118,7 @@ FAILED = {
     "disagreement_px": "Two halves of the tie points tell different corrections.",
     "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
     "shading": "Light falls differently on the two images: one is shaded like relief.",
+    "repeated": "Labels, collars or the like on both images fit, and the ground does not.",
     "rival_motion": "Nearly as many patches agree on another motion as on the one followed: a part "
     "that moves by itself, or a bend.",
     "support": "Too many areas look alike better elsewhere than in place.",

@@ -60,8 +60,17 @@ _OTHERWISE = (
 )
 
 
+_DRAWN = (
+    "Labels, a collar or the like are drawn on both images with one value: say that it is no data "
+    "(`ms_nodata`, `pan_nodata`), and the ground is matched without them."
+)
+"""Comes before all others: what is drawn disturbs everything else that is measured."""
+
+
 def remedy_for(failed: AbstractSet[str]) -> str:
     """What helps when these reasons refused, in a sentence or two."""
+    if "repeated" in failed:
+        return _DRAWN
     for names, text in _REMEDIES:
         if failed and failed <= names:
             return text

@@ -16,7 +16,14 @@ from rasterio.windows import Window
 
 import geodelreg
 from benchmarks.gate.bent_cases import BentPair
-from benchmarks.gate.distortions import Tear, fade, gradient_contrast, relief_shading, waves
+from benchmarks.gate.distortions import (
+    Tear,
+    fade,
+    frame,
+    gradient_contrast,
+    relief_shading,
+    waves,
+)
 from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
 from geodelreg import Alignment, AlignOptions
@@ -153,6 +160,35 @@ def test_a_shaded_image_is_refused_though_clipped_clouds_hold_most_of_its_contra
     shaded = relief_shading(clipped[0], np.random.default_rng(3))
     pair = BentPair(replace(scene, ms=shaded, pan=clipped[1]))
     assert "shading" in failed(refusal(written(tmp_path, pair))[1])
+
+
+def drawn_on(folder: Path, kind: str, same_ground: bool) -> Made:
+    """A pair, or a scene and its mirror image, with the same structure on the grid of both."""
+    imagery, spec = sample_imagery(), replace(SPEC, error=HeaderError((6.0, -4.0)))
+    scene = make_scene(spec, imagery)
+    if not same_ground:
+        mirrored = replace(imagery, bands=np.ascontiguousarray(imagery.bands[:, :, ::-1]))
+        scene = replace(scene, pan=make_scene(spec, mirrored).pan)
+    frame((scene.ms, scene.pan), kind, np.random.default_rng(2))
+    return written(folder, BentPair(scene, same_ground=same_ground))
+
+
+def test_labels_on_two_places_do_not_make_them_one(tmp_path: Path) -> None:
+    error, alignment = refusal(drawn_on(tmp_path, "labels", same_ground=False))
+    assert "repeated" in failed(alignment)
+    assert "4000 in MS, 4000 in PAN" in str(error)
+    assert "`pan_nodata`" in error.remedy
+
+
+def test_a_pattern_of_the_pixel_grid_is_left_out_when_told(tmp_path: Path) -> None:
+    pair = drawn_on(tmp_path, "fixed pattern", same_ground=True)
+    told = geodelreg.align(pair.ms, pair.pan, AlignOptions(ms_nodata=4000, pan_nodata=4000))
+    assert pair.rms_px(told.correction.corrected) < 0.1
+
+
+def test_ground_that_is_right_beside_labels_is_no_less_so(tmp_path: Path) -> None:
+    pair = drawn_on(tmp_path, "labels", same_ground=True)
+    assert pair.rms_px(geodelreg.align(pair.ms, pair.pan).correction.corrected) < 0.1
 
 
 def test_a_scale_is_found_from_a_corner_that_shows_something(tmp_path: Path) -> None:
