@@ -58,6 +58,8 @@ with the library (its noise is about 0.05 px; on the aerial and the small pairs 
 by far more, as the median window shows). Tie points: the median distance of theirs from the
 fit, in PAN px."""
 NAIP = "naip/m_4709963_se_14_1_{}.tif"
+SENTINEL_MS = "sentinel2/s2_20m_b05_b06_b07_b8a_b11_b12.tif"
+SENTINEL_PAN = "sentinel2/s2_10m_b02_b03_b04_b08.tif"
 PAIRS: tuple[Pair, ...] = (
     Pair("landsat8_momotombo", "landsat8_momotombo/ms.tif", "landsat8_momotombo/pan.tif"),
     Pair("landsat8_oman", "landsat8_oman/ms.tif", "landsat8_oman/pan.tif"),
@@ -66,6 +68,10 @@ PAIRS: tuple[Pair, ...] = (
     Pair(
         "landsat8_twodates", "landsat8_twodates/20190809.tif", "landsat8_twodates/20190825.tif", 3
     ),
+    # Half of it is water; the header is right.
+    Pair("sentinel2 20 m on B02", SENTINEL_MS, SENTINEL_PAN, 1),
+    Pair("sentinel2 20 m on B04", SENTINEL_MS, SENTINEL_PAN, 3),
+    Pair("sentinel2 20 m on B08", SENTINEL_MS, SENTINEL_PAN, 4),
     Pair("cbers4a", "cbers4a/ms.tif", "cbers4a/pan.tif", window_px=24, stride_px=8),
     Pair("naip 2012/2014", NAIP.format(20120731), NAIP.format(20140720), 4, 0, 64, 32),
     Pair("naip 2018/2019", NAIP.format(20180716), NAIP.format(20190904), 4, 0, 64, 32),

@@ -49,6 +49,9 @@ _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others 
 _CONTRADICTION_SIGMAS = 4.0
 _CONTRADICTION_FLOOR_PX = 0.05  # of MS; unexplained: ablate
 _RELIEF_SIGMAS = 2.0
+_STILL_PX = 0.4
+"""Of a patch pixel: clouds of real Landsat pairs move by 0.45 to 1.3, unlike bands by up to 0.3."""
+_STILL_SHARE = 0.98  # fewer than so many see no cloud that could matter
 CLEARLY = 0.8  # of the standard error; unexplained: ablate
 
 _RIVAL_TOLERANCE = 0.2  # of a patch pixel; unexplained: ablate
@@ -239,6 +242,27 @@ def same_place(pair: Pair, one: Pass, other: Pass) -> bool:
     gap, sigma = difference(pair, one, other)
     scatter = _RELIEF_SIGMAS * max(one.scatter_px, other.scatter_px)
     return gap <= _CONTRADICTION_SIGMAS * sum(sigma) + max(scatter, _CONTRADICTION_FLOOR_PX)
+
+
+def nothing_moves(everything: Pass, unit: float) -> bool:
+    """True when hardly any patch lies elsewhere than the others: what is bright is no cloud.
+
+    Parameters
+    ----------
+    everything : Pass
+        Bright objects included.
+    unit : float
+        MS pixels to one pixel of a patch.
+    """
+    if everything.estimate is None:
+        return False
+    matched = np.isin(everything.status, (Status.KEPT, *ELSEWHERE))
+    textured = int((everything.status != Status.TEXTURE).sum())
+    if not matched.sum() > _CALM_PATCHES * textured:
+        return False
+    points = everything.points.take(np.flatnonzero(matched))
+    gap = np.hypot(*(everything.estimate.map.forward(points.source) - points.target).T)
+    return bool((gap <= _STILL_PX * unit).mean() >= _STILL_SHARE)
 
 
 def ground_alone(pair: Pair, ground: Pass, everything: Pass) -> bool:

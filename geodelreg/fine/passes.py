@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fine.layers import Pass, ground_alone, is_telling, same_place
+from geodelreg.fine.layers import Pass, ground_alone, is_telling, nothing_moves, same_place
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.looks import HAZE, PLAIN, SHARPER, Look, preference, sharpest
 from geodelreg.fine.matching import match_pass
@@ -205,7 +205,10 @@ def _of_the_ground(
     everything = _passes(part, tiles, near, size, (PLAIN, *SHARPER))
     if guess.bright is None:
         return everything
-    if everything is not None and (everything.is_blurred or everything.last.is_calm):
+    unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
+    if everything is not None and (
+        everything.is_blurred or everything.last.is_calm or nothing_moves(everything.last, unit)
+    ):
         return everything
     hidden = [dark_tile(part, tile, guess) for tile in tiles]
     from_header = _is_near_header(part, near)
