@@ -141,7 +141,7 @@ CASES = {
     "negative tolerance": (("ms.tif", "pan.tif", "--tolerance", "-1"), "--tolerance"),
     "tolerance is a word": (("ms.tif", "pan.tif", "--tolerance", "tight"), "--tolerance"),
     "no output": (("ms.tif", "pan.tif", "-o", "out.tif"), "-o"),
-    "band zero": (("ms.tif", "pan.tif", "-b", "0"), "--band = 0"),
+    "band zero": (("ms.tif", "pan.tif", "-b", "0"), "--band 0"),
     "impossible GDAL option": (("ms.tif", "pan.tif", "--config", "A=B", "C"), "--config A=B C"),
 }
 
