@@ -40,6 +40,7 @@ from geodelreg.writing import (
     masks_of,
     placement_of,
 )
+from geodelreg.writing_bands import placed_bands
 
 
 def pansharpen(
@@ -155,7 +156,7 @@ def _sharpening(
 ) -> Sharpening:
     with open_raster(pan_path, allow=allow) as reader:
         check_band(reader, pan_band)
-    files = [_spectral_file(path, alignment, allow) for path in paths]
+    files = [one for path in paths for one in _spectral_files(path, alignment, allow)]
     bands = spectral_bands(files, options.given_bands())
     what = Sharpening(files, pan_path, pan_band, bands)
     check_finer(what)
@@ -204,15 +205,34 @@ def _paths(rasters: Sequence[Opened], stack: ExitStack) -> list[Path]:
     return paths
 
 
-def _spectral_file(path: Path, alignment: Alignment | None, allow: str) -> SpectralFile:
+def _spectral_files(path: Path, alignment: Alignment | None, allow: str) -> list[SpectralFile]:
+    """A file where it lies, once for each band where these have places of their own."""
     with open_dataset(str(path), allow=allow) as dataset:
-        if alignment is not None:
-            correction, _ = correction_of_file(alignment, path)
-            placement = placement_of(alignment, correction)
-            return SpectralFile.of(path, dataset, correction, placement)
-        grid = dataset_grid(str(path), dataset)
-        as_it_is = Correction("none", grid.crs_wkt, grid.transform, grid.transform)
-        return SpectralFile.of(path, dataset, as_it_is)
+        if alignment is None:
+            grid = dataset_grid(str(path), dataset)
+            as_it_is = Correction("none", grid.crs_wkt, grid.transform, grid.transform)
+            return [SpectralFile.of(path, dataset, as_it_is)]
+        correction, _ = correction_of_file(alignment, path)
+        placement = placement_of(alignment, correction)
+        whole = SpectralFile.of(path, dataset, correction, placement)
+    if not alignment.solution.bands:
+        return [whole]
+    if alignment.source.in_memory:
+        raise UsageError(
+            "bands with places of their own (`per_band=True`) are sharpened from files only",
+            "Give paths, also where they are aligned.",
+        )
+    found, own = [], placed_bands(alignment, path, correction)
+    for band in whole.bands:
+        one = replace(whole, bands=[band])
+        affine = own[band].as_affine() if band in own else None
+        if affine is not None:
+            moved = replace(correction, corrected=correction.original @ affine)
+            one = replace(one, correction=moved, placement=None)
+        elif band in own:
+            one = replace(one, placement=own[band])
+        found.append(one)
+    return found
 
 
 def _weights(what: Sharpening, options: PansharpenOptions) -> list[float]:

@@ -30,7 +30,7 @@ from geodelreg.product.warp import (
     warped_onto,
 )
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import Grid
+from geodelreg.values.raster import BoolArray, Grid
 from geodelreg.values.result import Correction
 
 _ROUNDING = 1e-3  # of pixel sizes in unlike CRSs
@@ -165,6 +165,24 @@ def on_grid(what: Sharpening, grid: Grid, resampling: str, scratch: Path) -> Ite
         yield files
 
 
+def cover_of(dataset: Any, band: int) -> str:
+    """What says where a band is covered, as a source band of GDAL's VRTs: alpha, or its mask.
+
+    GDAL makes masks of alpha for two and four bands only.
+    """
+    from rasterio.enums import ColorInterp
+
+    is_alpha = dataset.count > 1 and dataset.colorinterp[-1] is ColorInterp.alpha
+    return str(dataset.count) if is_alpha else f"mask,{band}"
+
+
+def covered(dataset: Any, source: str, window: Any = None) -> BoolArray:
+    """(H, W) where something covers a dataset, by what `cover_of` says."""
+    kind, _, band = source.rpartition(",")
+    read = dataset.read_masks if kind else dataset.read
+    return np.asarray(read(int(band), window=window) > 0)
+
+
 @dataclass(frozen=True, slots=True)
 class Recipe:
     """Everything on one grid, as files that GDAL reads when pixels are asked for.
@@ -177,14 +195,14 @@ class Recipe:
         Virtual raster of each MS file.
     pan : (Path, int)
         PAN and its band.
-    covers : list of (Path, int)
-        Bands whose masks, all together, say what is covered.
+    covers : list of (Path, str)
+        What says, all together, what is covered: files and their `cover_of`.
     """
 
     folder: Path
     files: list[Path]
     pan: tuple[Path, int]
-    covers: list[tuple[Path, int]]
+    covers: list[tuple[Path, str]]
 
 
 def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recipe:
@@ -193,14 +211,15 @@ def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recip
     import rasterio.shutil
 
     files = [out.with_name(f"{out.name}.ms{n}.vrt") for n in range(1, len(what.sources) + 1)]
-    covers: list[tuple[Path, int]] = []
+    covers: list[tuple[Path, str]] = []
     with on_grid(what, grid, resampling, out.parent) as warped:
         for number, (path, lazy) in enumerate(zip(files, warped, strict=True)):
             rasterio.shutil.copy(lazy, path, driver="VRT")
             if what.sources[number].placement is None:
                 _name_source(path, what.sources[number].path)
             used = [band for file, band in what.bands if file == number]
-            covers += [(path, band) for band in (used if lazy.nodata is not None else used[:1])]
+            each = used if lazy.nodata is not None else used[:1]
+            covers += [(path, cover_of(lazy, band)) for band in each]
     pan = (what.reference, what.pan_band)
     with open_raster(what.reference) as dataset:
         flags = {flag.name for flag in dataset.mask_flag_enums[what.pan_band - 1]}
@@ -208,8 +227,8 @@ def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recip
             pan = (out.with_name(f"{out.name}.pan.vrt"), what.pan_band)
             with warped_onto(dataset, grid, Validity.of(dataset), "nearest") as lazy:
                 rasterio.shutil.copy(lazy, pan[0], driver="VRT")
+                covers.append((pan[0], cover_of(lazy, what.pan_band)))
             _name_source(pan[0], what.reference)
-            covers.append(pan)
     return Recipe(out.parent, files, pan, covers)
 
 

@@ -33,6 +33,8 @@ from geodelreg.product.common_grid import (
     Recipe,
     Sharpening,
     SpectralFile,
+    cover_of,
+    covered,
     on_grid,
     recipe_of,
     target_grid,
@@ -104,10 +106,10 @@ def matched_samples(what: Sharpening) -> tuple[Float32Array, Float32Array]:
         grid = Grid(pan.transform @ to_full, (height, width), pan.crs.to_wkt())
         with scratch_folder() as folder, on_grid(what, grid, "average", folder) as files:
             bands = np.stack([files[file].read(band) for file, band in what.bands])
-            masks = [files[file].read_masks(band) > 0 for file, band in what.bands]
+            masks = [covered(files[file], cover_of(files[file], band)) for file, band in what.bands]
         with warped_onto(pan, grid, Validity.of(pan), "average") as averaged:
             values = averaged.read(what.pan_band)
-            masks.append(averaged.read_masks(what.pan_band) > 0)
+            masks.append(covered(averaged, cover_of(averaged, what.pan_band)))
     good = np.logical_and.reduce(masks)
     return bands[:, good].astype(np.float32), values[good].astype(np.float32)
 
@@ -235,8 +237,8 @@ def _source_xml(path: Path, band: int | str, folder: Path) -> str:
 def _mask_xml(recipe: Recipe) -> str:
     """Valid where every input is; the product of masks that are 0 where there is nothing."""
     sources = "".join(
-        f"<SimpleSource>{_source_xml(path, f'mask,{band}', recipe.folder)}</SimpleSource>"
-        for path, band in recipe.covers
+        f"<SimpleSource>{_source_xml(path, source, recipe.folder)}</SimpleSource>"
+        for path, source in recipe.covers
     )
     kind = 'subClass="VRTSourcedRasterBand">'
     if len(recipe.covers) > 1:
@@ -313,7 +315,7 @@ def _write_tiff(
         profile = _profile(sharp, grid, nodata) | {
             key.lower(): value for key, value in user_creation(options).items()
         }
-        covers = [(stack.enter_context(open_raster(p)), band) for p, band in recipe.covers]
+        covers = [(stack.enter_context(open_raster(p)), source) for p, source in recipe.covers]
         with rasterio.open(draft, "w", **profile) as dataset:
             dataset.descriptions = names
             dataset.update_tags(**tags)
@@ -322,7 +324,7 @@ def _write_tiff(
                 size = min(_TILE_PX, width - left), min(_TILE_PX, height - top)
                 window = Window(left, top, *size)
                 data = sharp.read(window=window)
-                cover = [file.read_masks(band, window=window) > 0 for file, band in covers]
+                cover = [covered(file, source, window) for file, source in covers]
                 valid = np.logical_and.reduce(cover)
                 if nodata is not None:
                     _mark(data, valid, nodata)

@@ -179,6 +179,21 @@ def test_a_mask_tells_what_is_not_covered_when_there_is_no_no_data_value(tmp_pat
         assert mask.sum() == 400
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_the_mask_is_that_of_any_number_of_bands(tmp_path: Path, count: int) -> None:
+    """GDAL makes masks of an alpha band beside one or three bands, and of no other number."""
+    bands = np.full((count, 20, 20), 100, dtype=np.uint16)
+    ms = write(tmp_path / "ms.tif", bands, Affine(2, 0, ORIGIN[0], 0, -2, ORIGIN[1]))
+    place = Affine(1, 0, ORIGIN[0] - 10, 0, -1, ORIGIN[1] + 10)
+    pan = write(tmp_path / "pan.tif", np.full((1, 60, 60), 90, dtype=np.uint16), place)
+    for name in ("sharp.tif", "sharp.vrt"):
+        geodelreg.pansharpen(ms, pan, tmp_path / name, weights="equal")
+        with rasterio.open(tmp_path / name) as dataset:
+            mask = dataset.dataset_mask() > 0
+        assert mask[10:50, 10:50].all()
+        assert mask.sum() == 1600
+
+
 def test_pan_that_is_not_everywhere_hides_what_it_does_not_show(tmp_path: Path) -> None:
     ms = ramps(tmp_path, 2, (0.0, 0.0), side=20)
     data = np.full((1, 40, 40), 500, dtype=np.uint16)

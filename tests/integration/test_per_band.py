@@ -165,3 +165,18 @@ def test_what_has_one_place_for_all_bands_is_refused(apart: Made, tmp_path: Path
     with pytest.raises(UsageError, match="each band"):
         AlignOptions(per_band=True, band=2)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["sharp.tif", "sharp.vrt"])
+def test_each_band_is_sharpened_where_it_lies(apart: Made, tmp_path: Path, name: str) -> None:
+    """As what `write` has resampled onto PAN's grid, sharpened as it is."""
+    onto = tmp_path / "onto.tif"
+    geodelreg.write(apart.alignment, onto, warp=True, warp_grid="pan")
+    geodelreg.pansharpen(onto, apart.pan, tmp_path / "expected.tif", weights="equal")
+    out = tmp_path / name
+    geodelreg.pansharpen(apart.ms, apart.pan, out, weights="equal", alignment=apart.alignment)
+    with rasterio.open(out) as sharp, rasterio.open(tmp_path / "expected.tif") as expected:
+        covered = (sharp.dataset_mask() > 0) & (expected.dataset_mask() > 0)
+        assert covered.mean() > 0.2
+        gap = np.abs(sharp.read().astype(float) - expected.read())[:, covered]
+    assert np.quantile(gap, 0.999) <= 1
