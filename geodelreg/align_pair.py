@@ -19,6 +19,7 @@ from geodelreg.errors import NoOverlapError
 from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.least_squares import Matched
 from geodelreg.fine.matching import patches_log_nfa, tie_points
+from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fine.per_band import match_each_band
 from geodelreg.fine.settle import settle
@@ -29,6 +30,7 @@ from geodelreg.fit.models import PARAMETER_COUNT, Frame
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import (
+    clouds_in_the_way,
     is_worthwhile,
     judge,
     nothing_agrees,
@@ -246,19 +248,21 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     guess, refined, fitted = found
     options = pair.options
     notes: tuple[str, ...] = ()
+    clouds = 0.0
     with pair.timings("evidence"):
         accuracy, evidence = gather(guess, refined, fitted, heard)
         if bent or passes(judge(evidence, options)):
             whole = look_at_whole(guess, refined, fitted.map)
             everyone = hear_everyone(pair, found, whole)
             closer = whole if everyone is None else whole.under(pair, everyone.map)
-            follows = may_bend(options) and (bent or options.model == "field")
-            follows |= may_bend(options) and closer.is_bent(options)
+            clouds = whole.clouds
+            may_follow = may_bend(options) and clouds <= LEAST_SHARE
+            follows = may_follow and (bent or options.model == "field" or closer.is_bent(options))
             if everyone is not None and not follows:
                 again = gather(guess, refined, everyone, heard)
                 if passes(judge(again[1], options)):
                     fitted, (accuracy, evidence), whole = everyone, again, closer
-            if follows or (may_bend(options) and whole.is_bent(options)):
+            if follows or (may_follow and whole.is_bent(options)):
                 refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
                 accuracy, evidence = gather(guess, refined, fitted, heard)
                 whole = whole.followed(pair, fitted)
@@ -274,7 +278,9 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         notes += unheard_bands(pair, bands)
     moves = any(_moves(pair, one) for one in (fitted.map, *(band.map for band in bands)))
     if options.model == "field" and model != "field" and passes(reasons):
-        reasons = (*reasons, too_few_for_a_field(accuracy.kept))
+        in_the_way = clouds > LEAST_SHARE
+        why = clouds_in_the_way(clouds) if in_the_way else too_few_for_a_field(accuracy.kept)
+        reasons = (*reasons, why)
     names = [pair.source.band_names[band - 1] for band in pair.source_bands]
     return Solution(
         model=model,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -21,7 +21,7 @@ from geodelreg.judge.words import lies
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
-from geodelreg.values.raster import Band, Float32Array
+from geodelreg.values.raster import Band, Float32Array, FloatArray
 
 _BAND_SHARE = 0.5
 """Of the patches that the best band matches: bands that match fewer have no say."""
@@ -30,6 +30,9 @@ _CLEARLY = 0.9
 """Of the unexplained detail: bands that were moved have 0.75 and less, others 0.96 and more."""
 _DETAIL_PX = 2.0
 """Of the overview: only detail finer than this tells one place from the next."""
+_AROUND_PX = 0.5
+"""Of the overview: within this a parabola follows what remains unexplained."""
+_NO_MOVE = np.zeros(2)
 _ALL_VALID = 0.99  # share of a pixel that was resampled; the rest is rounding
 _FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
@@ -65,7 +68,8 @@ def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
         Each of one band alone.
     pair : Pair
     """
-    return next(_furthest(_heard(found), pair), (BandsApart(), 0, 0))[0]
+    furthest = next(_gaps(_heard(found), pair), None)
+    return BandsApart() if furthest is None else furthest.told(pair)
 
 
 def ground_apart(
@@ -89,45 +93,76 @@ def ground_apart(
     """
     images = guess.images.source
     step = ~images[0].grid.transform @ pair.source.grid.transform
-    at = pair.source_centre
-    places = {p.band: p.found.estimate.map.forward(at)[0] for p in found if p.found.estimate}
-
-    def unexplained(one: int, other: int) -> float:
-        move = places[other] - places[one]
-        back = (float(move[0] * step.a), float(move[1] * step.e))
-        here = _unexplained(images[one], images[other], (0.0, 0.0))
-        return _unexplained(images[one], images[other], back) / here if here > 0 else 1.0
-
-    for apart, one, other in _furthest(found, pair):
-        if apart.distance_px <= least_px:
+    scale = np.array([step.a, step.e])
+    best, most = BandsApart(), 0.0
+    for gap in _gaps(found, pair):
+        if gap.sure_px <= least_px:
             break
-        if max(unexplained(one, other), unexplained(other, one)) < _CLEARLY:
-            return apart
-    return BandsApart()
+        one, other, move = images[gap.one], images[gap.other], (gap.there - gap.here) * scale
+        here, there = _unexplained(one, other, _NO_MOVE), _unexplained(one, other, move)
+        back = _unexplained(other, one, _NO_MOVE), _unexplained(other, one, -move)
+        if there < _CLEARLY * here and back[1] < _CLEARLY * back[0]:
+            closer = gap.here + _closer(one, other, move, there) / scale
+            told = replace(gap, there=closer).told(pair)
+            # of pairs as far apart, the one that looks most alike is surest of where it lies
+            if told.distance_px * (1.0 - there) > most:
+                best, most = told, told.distance_px * (1.0 - there)
+    return best if best.distance_px > least_px else BandsApart()
 
 
-def _furthest(found: Sequence[BandPass], pair: Pair) -> Iterator[tuple[BandsApart, int, int]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gap:
+    """Two bands, and where each puts the centre of MS, in header pixels."""
+
+    one: int
+    other: int
+    here: FloatArray
+    there: FloatArray
+    sigma_px: float
+
+    @property
+    def sure_px(self) -> float:
+        return float(np.hypot(*(self.there - self.here))) - _SURE_SIGMAS * self.sigma_px
+
+    def told(self, pair: Pair) -> BandsApart:
+        # content that lies further right comes, at one pixel, from further left
+        move = np.diff(pair.header.forward(np.stack([self.there, self.here])), axis=0)[0]
+        one, other = (
+            pair.source.band_names[pair.source_bands[n] - 1] for n in (self.one, self.other)
+        )
+        return BandsApart(max(self.sure_px, 0.0), f"{other} {lies(move, one)}")
+
+
+def _gaps(found: Sequence[BandPass], pair: Pair) -> Iterator[_Gap]:
     """All pairs of bands that are apart beyond their standard errors, the furthest first."""
     at = pair.source_centre
     maps = [(p.band, p.found.estimate.map) for p in found if p.found.estimate is not None]
     if len(maps) < 2:
         return
     places = np.concatenate([m.forward(at) for _, m in maps])
-    sigmas = np.array([float(m.sigma_at(at)[0]) for _, m in maps])
+    sigmas = [float(m.sigma_at(at)[0]) for _, m in maps]
     odd = np.hypot(*(places - np.median(places, axis=0)).T)
-    pairs = np.array(list(combinations(np.argsort(odd, kind="stable").tolist(), 2)))
-    gaps = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)
-    sure = gaps - _SURE_SIGMAS * np.hypot(*sigmas[pairs].T)
-    for number in np.argsort(-sure, kind="stable"):
-        if sure[number] <= 0:
-            return
-        one, other = pairs[number]
-        # content that lies further right comes, at one pixel, from further left
-        there, here = pair.header.forward(places[[other, one]])
-        bands = maps[one][0], maps[other][0]
-        names = [pair.source.band_names[pair.source_bands[band] - 1] for band in bands]
-        words = f"{names[1]} {lies(here - there, names[0])}"
-        yield BandsApart(float(sure[number]), words), *bands
+    gaps = [
+        _Gap(
+            maps[n][0], maps[m][0], places[n], places[m], float(np.hypot(sigmas[n], sigmas[m]))
+        )
+        for n, m in combinations(np.argsort(odd, kind="stable").tolist(), 2)
+    ]  # fmt: skip
+    yield from sorted((gap for gap in gaps if gap.sure_px > 0), key=lambda gap: -gap.sure_px)
+
+
+def _closer(one: Band, other: Band, move: FloatArray, there: float) -> FloatArray:
+    """The move, pixels of the images, at which the bands explain most of each other.
+
+    A band that looks unlike PAN is matched to it some tenths of a pixel off; another band is not.
+    """
+    best = move.copy()
+    for axis in np.eye(2) * _AROUND_PX:
+        before, after = (_unexplained(one, other, move + side * axis) for side in (-1.0, 1.0))
+        bend = before - 2.0 * there + after
+        if bend > 0:
+            best += np.clip((before - after) / (2.0 * bend), -1.0, 1.0) * axis
+    return best
 
 
 def _heard(found: Sequence[BandPass]) -> list[BandPass]:
@@ -173,7 +208,7 @@ def _start(guess: Guess, pair: Pair, band: int, heard: set[int]) -> AffineMap | 
     return AffineMap(Affine.translation(-shift[0] * step.a, -shift[1] * step.e))
 
 
-def _unexplained(one: Band, other: Band, moved: tuple[float, float]) -> float:
+def _unexplained(one: Band, other: Band, moved: FloatArray) -> float:
     """Share of one band's detail, read (x, y) further, that the other does not explain."""
     height, width = one.valid.shape
     matrix = np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]])

@@ -24,6 +24,9 @@ _BY_CHANCE = 0.125  # twice 1/17: the best of 17 like places; unexplained: ablat
 _TESTED_PATCHES = 160  # unexplained: ablate
 _LEAST_DISPLACED = 8  # half of the places
 _RESEMBLES = MIN_CORRELATION**2  # share of the variance that is explained
+_FEWEST_TEXTURED = 8
+"""Fewer than these prove nothing even if all are best in place: 0.125^8 by chance, and rarely all
+are; then what varies from pixel to pixel may be the ground itself, not noise."""
 
 
 class AreaEvidence(NamedTuple):
@@ -73,15 +76,22 @@ def area_evidence(
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     offsets = np.concatenate([np.zeros((1, 2)), *(ring * radius for radius in _DISPLACED_RADII)])
     every = sample_step([tile.template[0] for tile in tiles], size, _TESTED_PATCHES) if few else 1
-    there, counts = part.to_surface(correction), [AreaEvidence()]
-    for number, tile in enumerate(tiles):
-        bands, surface = tile_images(part, tile, tuning)
-        patches = cut_patches(bands, part.template.grid, size)
-        chosen = np.arange(number % every, len(patches), every)
-        chosen = chosen[_textured(bands, patches.take(chosen))]
-        scores = _explained(there, surface, patches, chosen, offsets)
-        counts.append(best_in_place(scores))
-    return AreaEvidence(*map(sum, zip(*counts, strict=True)))
+    there = part.to_surface(correction)
+
+    def asked(flat_too: bool) -> AreaEvidence:
+        counts = [AreaEvidence()]
+        for number, tile in enumerate(tiles):
+            bands, surface = tile_images(part, tile, tuning)
+            patches = cut_patches(bands, part.template.grid, size)
+            chosen = np.arange(number % every, len(patches), every)
+            if not flat_too:
+                chosen = chosen[_textured(bands, patches.take(chosen))]
+            scores = _explained(there, surface, patches, chosen, offsets)
+            counts.append(best_in_place(scores))
+        return AreaEvidence(*map(sum, zip(*counts, strict=True)))
+
+    textured = asked(flat_too=False)
+    return textured if textured.tested >= _FEWEST_TEXTURED else asked(flat_too=True)
 
 
 def _textured(bands: list[Band], patches: Patches) -> BoolArray:

@@ -188,6 +188,15 @@ def too_few_for_a_field(points: int) -> Reason:
     return Reason("field_points", float(points), float(FEWEST_POINTS), False, message)
 
 
+def clouds_in_the_way(share: float) -> Reason:
+    """The reason when a field was asked for and much moves as clouds do: it would follow them.
+
+    One affine is told from clouds because they do not move as one; a field may move as they do.
+    """
+    message = f"{share:.4g} of the patches move as clouds do, and a field would follow them"
+    return Reason("field_clouds", share, LEAST_SHARE, False, f"{message} (needs ≤ {LEAST_SHARE:g})")
+
+
 def verdict(reasons: tuple[Reason, ...], moves: bool) -> Verdict:
     """Aligned or already aligned when every reason passed, else refused."""
     if not passes(reasons):

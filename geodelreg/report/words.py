@@ -91,6 +91,10 @@ REASONS = {
     "bands": ("Bands lie together", "Distance between bands of MS that other bands confirm."),
     "strain": ("The field folds nothing", "Largest strain of the field."),
     "field_points": ("Enough points for a field", "A field on few points bends between them."),
+    "field_clouds": (
+        "No clouds for a field to follow",
+        "Share of the patches that move as clouds do: a field can move as they do.",
+    ),
     "keypoints_apart": (
         "No surer keypoints object",
         "Distance from where distinct features, more certain ones, put the ground; 0 without any.",
@@ -126,6 +130,7 @@ FAILED = {
     "bands": "No one correction is right for all bands of MS.",
     "strain": "The field is so steep somewhere that it would fold the ground.",
     "field_points": "Too few points are left to follow a bend.",
+    "field_clouds": "A field would follow the clouds.",
     "keypoints_apart": "Distinct features say another place than the patches.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",

@@ -22,6 +22,18 @@ _REMEDIES = (
         ),
     ),
     (
+        {"field_clouds"},
+        "Mask the clouds (`mask`), or ask for one affine (`model='affine'`).",
+    ),
+    (
+        {"rival_motion", "support", "log_nfa"},
+        (
+            "Much of the ground moves otherwise. Mask clouds (`mask`); where the ground bends, as "
+            "over relief or under a moving sensor, `warp=True` follows it, if enough of it can be "
+            "matched; of a repeated pattern, `band` may name a band that shows more."
+        ),
+    ),
+    (
         {"bands", "bands_apart"},
         (
             "The bands of MS do not agree, or show clouds: correct each by itself "

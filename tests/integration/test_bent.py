@@ -128,6 +128,13 @@ def test_check_calls_both_misaligned(wavy: Made, torn: Made) -> None:
     assert "16 px left and 12 px down of the rest" in found.reason
 
 
+def test_no_field_follows_clouds(tmp_path: Path) -> None:
+    cloudy = written(tmp_path, BentPair(make_scene(CLOUDY, sample_imagery())))
+    error, alignment = refusal(cloudy, model="field")
+    assert failed(alignment) == {"field_clouds"}
+    assert "`mask`" in error.remedy
+
+
 def test_a_raster_of_a_few_patches_is_not_torn_in_silence(tmp_path: Path) -> None:
     small = replace(SPEC, pan_shape=(360, 360), ms_shape=(82, 82), ratio=4.0)
     torn = made(tmp_path, Tear((3.0, 20.0), 0.4, 0.0, small.pan_shape), small)

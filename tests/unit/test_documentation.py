@@ -99,7 +99,7 @@ def test_every_reason_of_the_gate_has_an_entry_that_begins_with_its_message() ->
     page = (ROOT / "docs" / "refusals.md").read_text(encoding="utf-8")
     entries = re.findall(r"^### ([^\n]*)\n\n> ([^\n]*)\n(.*?)(?=^#)", page, re.M | re.S)
     explained = {name: said for heading, said, _ in entries for name in re.findall(r"\w+", heading)}
-    assert set(explained) == {*messages, "field_points"}
+    assert set(explained) == {*messages, "field_points", "field_clouds"}
     for name, message in messages.items():
         if name not in ("max_rotation", "max_scale"):  # share an entry with max_shift
             words = explained[name].partition(" ")[2].split("…")
