@@ -185,9 +185,9 @@ def verdict_line(check: Check) -> str:
     metres = f" ({short(off.distance_m)} m)" if math.isfinite(off.distance_m) else ""
     if check.raster_outcome is CheckOutcome.MISALIGNED:
         local = f", {check.reason}" if check.reason else ""
-        return f"{name}: misaligned by {distance}{metres} where it is most{local} ({limit})"
+        return f"{name}: misaligned by up to {distance}{metres}{local} ({limit})"
     more = ", not significantly more" if off.distance_px > check.limit_px else ""
-    return f"{name}: aligned, off by {distance}{metres} where it is most ({limit}{more})"
+    return f"{name}: aligned, off by at most {distance}{metres} ({limit}{more})"
 
 
 def _with_sigma(value: float, sigma: float) -> str:

@@ -87,7 +87,7 @@ def test_the_tolerance_decides(write_ms: WriteMs) -> None:
     assert geodelreg.check(path, PAN, limit_px=0.5).outcome is CheckOutcome.MISALIGNED
     loose = geodelreg.check(path, PAN, limit_px=0.9)
     assert loose.outcome is CheckOutcome.ALIGNED
-    assert "aligned, off by 0.7" in check_text(loose)
+    assert "aligned, off by at most 0.7" in check_text(loose)
 
 
 def test_a_tolerance_below_the_standard_error_is_not_decided(write_ms: WriteMs) -> None:

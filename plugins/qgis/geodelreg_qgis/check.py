@@ -77,6 +77,4 @@ def _sentence(outcome: str, off: dict[str, Any]) -> str:
     words = outcome.replace("_", " ")
     if off["distance_px"] is None or off["sigma_px"] is None:
         return words
-    return (
-        f"{words}: off by {off['distance_px']:.3f} ± {off['sigma_px']:.3f} PAN px where it is most"
-    )
+    return f"{words}: off by at most {off['distance_px']:.3f} ± {off['sigma_px']:.3f} PAN px"
