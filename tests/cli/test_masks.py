@@ -133,7 +133,7 @@ def test_rios_plugin_takes_masks(pair: Path) -> None:
 def test_without_masks_nothing_of_them_is_loaded(pair: Path) -> None:
     code = (
         "import sys, geodelreg; geodelreg.check('ms.tif', 'pan.tif');"
-        "print([m for m in sys.modules if '.image.mask_' in m or m == 'geodelreg.raster.masks'],"
+        "print([m for m in sys.modules if '.raster.mask_' in m or m == 'geodelreg.raster.masks'],"
         " 'pyogrio' in sys.modules, 'rasterio.features' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=pair)
