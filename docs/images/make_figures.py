@@ -50,6 +50,44 @@ def torn(ms: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return moved(ms, shift)
 
 
+def mirrored(ms: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Other ground: no place of PAN looks like it."""
+    return np.ascontiguousarray(ms[:, :, ::-1])
+
+
+def corner(ms: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Nothing but a corner shows anything."""
+    noise = np.random.default_rng(0).normal(np.median(ms), 2.0, ms.shape)
+    out = noise.astype(np.uint16)
+    out[:, :40, :40] = ms[:, :40, :40]
+    return out
+
+
+def shaded(ms: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Bright slopes to one side, dark ones to the other, as light falls on relief."""
+    slope = np.gradient(
+        [cv2.GaussianBlur(band.astype(np.float32), (0, 0), 1.5) for band in ms], axis=2
+    )
+    return np.clip(1000 + 300 * slope / slope.std(), 1, 60_000).astype(np.uint16)
+
+
+def apart(ms: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """The third band lies elsewhere than the others."""
+    out = ms.copy()
+    out[2] = np.roll(ms[2], (2, 3), axis=(0, 1))
+    return out
+
+
+def draw_colours(ms: NDArray[np.uint16], name: str) -> None:
+    """Three bands as red, green and blue, a part of them enlarged."""
+    part = ms[[2, 1, 0], 60:140, 40:160].astype(np.float32)
+    low, high = np.percentile(part, (1, 99), axis=(1, 2), keepdims=True)
+    picture = (255 * np.clip((part - low) / (high - low), 0, 1)).astype(np.uint8)
+    Image.fromarray(np.ascontiguousarray(picture.transpose(1, 2, 0))).resize(
+        (WIDTH, WIDTH * 2 // 3), Image.Resampling.NEAREST
+    ).save(HERE / f"{name}.jpg", quality=80, optimize=True)
+
+
 def draw(ms: Path, kind: str, name: str) -> None:
     """A figure of a pair with PAN, aligned or refused, at the size of a page."""
     try:
@@ -73,7 +111,12 @@ def main() -> None:
     for kind in ("arrows", "mesh", "error", "matches"):
         draw(SAMPLES / "ms.tif", kind, f"figure_{kind}")
     with rasterio.open(SAMPLES / "ms.tif") as dataset, tempfile.TemporaryDirectory() as folder:
-        for harm, kind in ((bent, "arrows"), (torn, "mesh")):
+        draw_colours(apart(dataset.read()), "refusal_apart")
+        harms = (
+            (bent, "arrows"), (torn, "mesh"), (mirrored, "matches"), (corner, "mesh"),
+            (shaded, "before-after"),
+        )  # fmt: skip
+        for harm, kind in harms:
             path = Path(folder, f"{harm.__name__}.tif")
             with rasterio.open(path, "w", **dataset.profile) as out:
                 out.write(harm(dataset.read()))
