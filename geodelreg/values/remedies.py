@@ -26,7 +26,7 @@ _REMEDIES = (
         "Mask the clouds (`mask`), or ask for one affine (`model='affine'`).",
     ),
     (
-        {"rival_motion", "support", "log_nfa"},
+        {"rival_motion"},
         (
             "Much of the ground moves otherwise. Mask clouds (`mask`); where the ground bends, as "
             "over relief or under a moving sensor, `warp=True` follows it, if enough of it can be "
