@@ -19,7 +19,6 @@ from io import StringIO
 import click
 
 from geodelreg.errors import AlignmentRefusedError, GeodelregError, shown
-from geodelreg.flags import as_typed
 from geodelreg.version import __version__
 from geodelreg_cli.interrupts import Terminated, termination_as_exception
 
@@ -130,6 +129,8 @@ def run(args: Sequence[str]) -> int:
 def _explain(error: Exception) -> int:
     """Say on stderr what went wrong and what helps, and return the exit code."""
     if isinstance(error, GeodelregError):
+        from geodelreg.flags import as_typed
+
         kind = "refused" if isinstance(error, AlignmentRefusedError) else "error"
         _say(f"{kind}: {as_typed(error.cause)}")
         if error.remedy:

@@ -41,6 +41,14 @@ def test_help_and_version_load_nothing_heavy(args: list[str]) -> None:
     assert not modules & HEAVY
 
 
+@pytest.mark.parametrize("args", [["--version"], ["--help"]])
+def test_what_names_no_option_looks_at_none(args: list[str]) -> None:
+    code = f"import sys\nfrom geodelreg_cli.main import run\nrun({args!r})\n"
+    code += "print('MODULES', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "geodelreg.options" not in done.stdout.rpartition("MODULES ")[2].split()
+
+
 def test_importing_the_library_or_the_rio_plugin_loads_nothing_heavy() -> None:
     assert not modules_after("import geodelreg, geodelreg.errors, geodelreg.options") & HEAVY
     assert not modules_after("import geodelreg_cli.rio") & HEAVY
