@@ -26,7 +26,7 @@ from geodelreg.fine.settle import settle
 from geodelreg.fit.choice import Fitted, HeldOut, Selection, half_disagreement, select_model
 from geodelreg.fit.estimate import Estimate
 from geodelreg.fit.field import halves_apart, held_out_errors
-from geodelreg.fit.models import PARAMETER_COUNT, Frame
+from geodelreg.fit.models import Frame, points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import (
@@ -215,12 +215,11 @@ def fit_patches(
     tied = tie_points(part, last.matched, estimate.map, status)
     halves = points.take(estimate.inlier)
     apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
-    sample_size = PARAMETER_COUNT[estimate.model] // 2
     return Fitted(
         selection,
         tied,
         guess.counts | _patch_counts(last.matched, tied),
-        patches_log_nfa(part, tied, sample_size),
+        patches_log_nfa(part, tied, points_that_fix(estimate.model)),
         pair.pan_px_per_source_px * apart,
     )
 
@@ -343,7 +342,7 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         unseen = tied.residual_px.copy()
         unseen[tied.kept] = pair.pan_px_per_source_px * check.residual_px
         log_nfa = patches_log_nfa(
-            refined.part, replace(tied, residual_px=unseen), PARAMETER_COUNT["affine"] // 2
+            refined.part, replace(tied, residual_px=unseen), points_that_fix("field")
         )
     counts = guess.counts | _patch_counts(settled.matched, tied)
     return refined, Fitted(Selection(estimate, check), tied, counts, log_nfa, apart_px)

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import Field, fields
 from numbers import Integral, Real
+from typing import Any
 
 from geodelreg.errors import UsageError
 from geodelreg.masking import parse_mask
 
 
+def field_of(options: Any, name: str) -> Field[Any]:
+    """One field of options, or of their class."""
+    return {field.name: field for field in fields(options)}[name]
+
+
 def check_choice(options: object, name: str) -> None:
     """Take only what the field lists."""
-    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    spec = field_of(options, name)
     choices, value = spec.metadata["choices"], getattr(options, name)
     if value not in choices:
         raise UsageError(f"`{name}={value!r}` is unknown", f"Use one of: {', '.join(choices)}.")
@@ -46,7 +52,7 @@ def check_creation(options: object, name: str) -> None:
 
 def check_number(options: object, name: str) -> None:
     """Take only numbers, and whole ones for fields of these."""
-    spec = {f.name: f for f in fields(options)}[name]  # type: ignore[arg-type]
+    spec = field_of(options, name)
     value, is_whole = getattr(options, name), str(spec.type).startswith("int")
     if value is not None and not isinstance(value, Integral if is_whole else Real):
         raise TypeError(f"`{name}={value!r}` is no {'whole ' if is_whole else ''}number")

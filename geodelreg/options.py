@@ -6,7 +6,7 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from geodelreg.errors import UsageError
@@ -16,6 +16,7 @@ from geodelreg.option_checks import (
     check_masks,
     check_number,
     check_range,
+    field_of,
     keep_list,
 )
 
@@ -38,7 +39,7 @@ def _knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
 
 def knob_help(options: type, name: str) -> str:
     """Help text of one knob of an options class."""
-    return str({f.name: f for f in fields(options)}[name].metadata["help"])
+    return str(field_of(options, name).metadata["help"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +188,15 @@ class AlignOptions:
                 f"`method={self.method!r}` knows no field",
                 "Use `method='delaunay'`, or another model.",
             )
+
+
+def one_header(what: str = "") -> UsageError:
+    """The error of bands with places of their own where one header is written, to `what`."""
+    return UsageError(
+        f"{what}`per_band=True` finds a place for each band, and a header has one for all",
+        "Name a folder, for one file per band, or a .vrt of one MS file; or resample "
+        "(`warp=True`).",
+    )
 
 
 def check_header_holds(model: str) -> None:

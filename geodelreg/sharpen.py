@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from geodelreg.product.scratch import file_of, scratch_folder
 from geodelreg.raster.inputs import AnyRaster, Opened, opened, rasters_of
 from geodelreg.raster.opening import dataset_grid, open_dataset
 from geodelreg.raster.reader import check_band, open_raster
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.result import Alignment, Correction
 from geodelreg.writing import (
     AnyPath,
@@ -40,7 +41,7 @@ from geodelreg.writing import (
     masks_of,
     placement_of,
 )
-from geodelreg.writing_bands import placed_bands
+from geodelreg.writing_bands import bands_by_file, placed_bands
 
 
 def pansharpen(
@@ -156,7 +157,10 @@ def _sharpening(
 ) -> Sharpening:
     with open_raster(pan_path, allow=allow) as reader:
         check_band(reader, pan_band)
-    files = [one for path in paths for one in _spectral_files(path, alignment, allow)]
+    by_file = {} if alignment is None else _bands_by_file(alignment)
+    files = [
+        one for path in paths for one in _spectral_files(path, alignment, by_file.get(path), allow)
+    ]
     bands = spectral_bands(files, options.given_bands())
     what = Sharpening(files, pan_path, pan_band, bands)
     check_finer(what)
@@ -205,8 +209,20 @@ def _paths(rasters: Sequence[Opened], stack: ExitStack) -> list[Path]:
     return paths
 
 
-def _spectral_files(path: Path, alignment: Alignment | None, allow: str) -> list[SpectralFile]:
-    """A file where it lies, once for each band where these have places of their own."""
+def _bands_by_file(alignment: Alignment) -> dict[Path, dict[int, PixelMap]]:
+    """Bands of each file that have a place of their own."""
+    if alignment.solution.bands and alignment.source.in_memory:
+        raise UsageError(
+            "bands with places of their own (`per_band=True`) are sharpened from files only",
+            "Give paths, also where they are aligned.",
+        )
+    return bands_by_file(alignment)
+
+
+def _spectral_files(
+    path: Path, alignment: Alignment | None, apart: Mapping[int, PixelMap] | None, allow: str
+) -> list[SpectralFile]:
+    """A file where it lies, once for each band where some have places of their own (`apart`)."""
     with open_dataset(str(path), allow=allow) as dataset:
         if alignment is None:
             grid = dataset_grid(str(path), dataset)
@@ -215,14 +231,9 @@ def _spectral_files(path: Path, alignment: Alignment | None, allow: str) -> list
         correction, _ = correction_of_file(alignment, path)
         placement = placement_of(alignment, correction)
         whole = SpectralFile.of(path, dataset, correction, placement)
-    if not alignment.solution.bands:
+    if not apart:
         return [whole]
-    if alignment.source.in_memory:
-        raise UsageError(
-            "bands with places of their own (`per_band=True`) are sharpened from files only",
-            "Give paths, also where they are aligned.",
-        )
-    found, own = [], placed_bands(alignment, path, correction)
+    found, own = [], placed_bands(alignment, apart, correction)
     for band in whole.bands:
         one = replace(whole, bands=[band])
         affine = own[band].as_affine() if band in own else None

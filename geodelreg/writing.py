@@ -15,7 +15,7 @@ from geodelreg.errors import AlignmentRefusedError, OutputUnwritableError, Usage
 from geodelreg.geotiff.targets import STDOUT
 from geodelreg.knobs import WriteKnobs
 from geodelreg.masking import parse_mask
-from geodelreg.options import WriteOptions, check_header_holds
+from geodelreg.options import WriteOptions, check_header_holds, one_header
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.raster.input_files import input_files
 from geodelreg.raster.reader import open_raster
@@ -65,7 +65,7 @@ def write(
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
-    from geodelreg.writing_bands import placed_bands
+    from geodelreg.writing_bands import bands_by_file, placed_bands
 
     check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
@@ -77,6 +77,7 @@ def write(
     if not (options.warp or options.georef == "gcps"):
         _check_header_holds(alignment)
     tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
+    by_file = bands_by_file(alignment) if options.warp else {}
     notes: list[str] = []
     with (
         _targets(alignment, Path(target)) as pairs,
@@ -86,6 +87,7 @@ def write(
             check_replaceable(out, options.overwrite, stale_beside(out, path))
         for path, out in pairs:
             correction, gcps = correction_of_file(alignment, path)
+            placement = placement_of(alignment, correction)
             if options.warp:
                 notes += write_warped(
                     path,
@@ -95,11 +97,10 @@ def write(
                     tags,
                     options,
                     pan,
-                    placement_of(alignment, correction),
-                    placed_bands(alignment, path, correction),
+                    placement,
+                    placed_bands(alignment, by_file.get(path, {}), correction),
                 )
             else:
-                placement = placement_of(alignment, correction)
                 if placement is not None:
                     gcps = _gcps_of_map(path, placement, alignment.options.allow)
                 notes += write_corrected(path, out, correction, gcps, tags, options)
@@ -146,10 +147,7 @@ def _gcps_of_map(path: Path, placement: PixelMap, allow: str) -> tuple[Gcp, ...]
 
 def _check_one_header(alignment: Alignment) -> None:
     if alignment.options.per_band:
-        raise UsageError(
-            "`per_band=True` finds a place for each band, and a header has one for all",
-            "Write to a folder, one file per band, to a .vrt, or resample (`warp=True`).",
-        )
+        raise one_header()
     _check_header_holds(alignment)
 
 

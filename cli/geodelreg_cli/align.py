@@ -13,7 +13,7 @@ import click
 from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.flags import as_typed
 from geodelreg.masking import parse_mask
-from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
+from geodelreg.options import AlignOptions, WriteOptions, check_header_holds, one_header
 from geodelreg_cli.console import log_steps, log_timings, progress_bar
 from geodelreg_cli.figure import kind_option
 from geodelreg_cli.options import (
@@ -210,10 +210,7 @@ def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     if _carries_all(write_options) and is_default("on_local"):
         options = replace(options, on_local="field")
     if options.per_band and given["in_place"]:
-        raise click.UsageError(
-            "--per-band finds a place for each band, and a header has one for all: name a folder "
-            "(-o), a .vrt, or resample (--warp)."
-        )
+        raise one_header()
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
     return Request(

@@ -18,6 +18,7 @@ from click.core import ParameterSource
 
 from geodelreg.errors import UsageError
 from geodelreg.flags import UNITS, as_typed, flags
+from geodelreg.option_checks import field_of
 from geodelreg.options import AlignOptions, knob_help
 from geodelreg_cli.console import configure_logging
 
@@ -104,7 +105,7 @@ def knob_option(options: type, knob: str, section: str) -> SectionOption:
     section : str
         Heading in the help.
     """
-    field = {f.name: f for f in fields(options)}[knob]
+    field = field_of(options, knob)
     return SectionOption(
         [knob, *flags(knob)],
         section=section,

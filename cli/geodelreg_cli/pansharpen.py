@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -91,15 +90,17 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     start_run(given)
     sources, reference = ms_and_pan(rasters)
     options, align_options = build(PansharpenOptions, given), build(AlignOptions, given)
-    if is_default("on_local") and not _is_lazy(given):
-        align_options = replace(align_options, on_local="field")
     import geodelreg
     from geodelreg.pair import part_of
+    from geodelreg.product.pansharpen import sharpened_driver
     from geodelreg.sharpen import check_sharpenable
     from geodelreg_cli.outputs import check_targets
 
     check_targets([*sources, reference], [given["output"]], options.overwrite)
     if not given["no_align"]:
+        # the geotransforms of a VRT must hold the correction
+        if is_default("on_local") and sharpened_driver(given["output"], options) != "VRT":
+            align_options = replace(align_options, on_local="field")
         check_sharpenable(sources, reference, given["output"], options, align_options)
     source = sources[0] if len(sources) == 1 else sources
     alignment: Alignment | None = None
@@ -124,9 +125,3 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
         from geodelreg.product.report import summary_text
 
         click.echo(as_typed(summary_text(alignment)), err=True)
-
-
-def _is_lazy(given: Mapping[str, Any]) -> bool:
-    """True of a VRT, whose geotransforms must hold the correction."""
-    suffix: str = given["output"].suffix
-    return (given["driver"] or suffix.removeprefix(".")).upper() == "VRT"

@@ -20,7 +20,7 @@ from geodelreg.fine.surface import make_surface
 from geodelreg.fine.tiles import Tile, overview_tile
 from geodelreg.fine.tuning import Tuning, decimation, fit_tone
 from geodelreg.fit.chance import log_nfa
-from geodelreg.fit.models import PARAMETER_COUNT
+from geodelreg.fit.models import points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.pair import Pair, Roles, roles
 from geodelreg.values.points import Guess, Overview, Status
@@ -93,7 +93,7 @@ def _log_nfa(part: Roles, tile: Tile, found: Pass) -> float:
     px = decimation(tile.template[0], part.template.grid)[0]
     px *= 1.0 if part.ms_is_template else part.surface_px_per_template_px
     gap = np.hypot(*(found.estimate.map.forward(points.source) - points.target).T) / px
-    return log_nfa(gap, (2 * MAX_MOVE) ** 2, PARAMETER_COUNT["affine"] // 2, MAX_MOVE)[0]
+    return log_nfa(gap, (2 * MAX_MOVE) ** 2, points_that_fix("affine"), MAX_MOVE)[0]
 
 
 def _by_edges(pair: Pair, images: Overview) -> tuple[Guess, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geodelreg.fit.models import NONLINEAR, PARAMETER_COUNT, Frame, design, fitted_map
+from geodelreg.fit.models import NONLINEAR, Frame, design, fitted_map, points_that_fix
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
@@ -86,7 +86,7 @@ class Estimate:
 
 def minimum_points(model: str) -> int:
     """Fewest points that determine a model with one to spare."""
-    return PARAMETER_COUNT[model] // 2 + 1
+    return points_that_fix(model) + 1
 
 
 def weighted_fit(

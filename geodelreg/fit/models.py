@@ -32,6 +32,11 @@ PARAMETER_COUNT = {
 """As many as `design` has columns."""
 
 
+def points_that_fix(model: str) -> int:
+    """Points that determine a model; of a field its trend, an affine."""
+    return PARAMETER_COUNT["affine" if model == "field" else model] // 2
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """Coordinates in which models are linear and well conditioned.

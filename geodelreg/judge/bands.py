@@ -99,9 +99,9 @@ def ground_apart(
         if gap.sure_px <= least_px:
             break
         one, other, move = images[gap.one], images[gap.other], (gap.there - gap.here) * scale
-        here, there = _unexplained(one, other, _NO_MOVE), _unexplained(one, other, move)
-        back = _unexplained(other, one, _NO_MOVE), _unexplained(other, one, -move)
-        if there < _CLEARLY * here and back[1] < _CLEARLY * back[0]:
+        little = _CLEARLY * _unexplained(one, other, _NO_MOVE)
+        there = _unexplained(one, other, move)
+        if there < little and _unexplained(other, one, -move) < little:
             closer = gap.here + _closer(one, other, move, there) / scale
             told = replace(gap, there=closer).told(pair)
             # of pairs as far apart, the one that looks most alike is surest of where it lies

@@ -15,7 +15,7 @@ from geodelreg.fine.surface import Surface, make_surface
 from geodelreg.fine.tiles import dark_tile, overview_tile
 from geodelreg.fine.tuning import surface_sigma
 from geodelreg.fit.choice import Fitted
-from geodelreg.fit.models import PARAMETER_COUNT
+from geodelreg.fit.models import points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
 from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
@@ -63,9 +63,8 @@ def gather(
         bands = find_bands(guess, refined, correction, pool)
         apart = bands_apart(bands, pair)
         told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
-        model = fitted.selection.estimate.model
-        size = PARAMETER_COUNT.get(model, PARAMETER_COUNT["affine"]) // 2  # a field's trend is one
-        repeated = pool.submit(proof_without_repeated, refined, correction, size)
+        enough = points_that_fix(fitted.selection.estimate.model)
+        repeated = pool.submit(proof_without_repeated, refined, correction, enough)
         area = area_evidence(*where, few=True)
         if area.log_chance > _SURE_LOG_CHANCE:
             area = area_evidence(*where, few=False)

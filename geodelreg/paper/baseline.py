@@ -22,7 +22,7 @@ from geodelreg.fine.passes import Refinement, refine
 from geodelreg.fit.chance import log_nfa
 from geodelreg.fit.choice import Fitted, Selection, held_out
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, weighted_fit
-from geodelreg.fit.models import PARAMETER_COUNT, Frame, fitted_map
+from geodelreg.fit.models import Frame, fitted_map, points_that_fix
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.pair import Pair, overlap_corners, roles
@@ -107,7 +107,7 @@ def paper_fit(pair: Pair, images: Overview) -> PaperFit | None:
         height, width = pair.reference.grid.shape
         radius = _CHANCE_RADIUS_PX * pair.pan_px_per_source_px
         gap = np.hypot(*points.residual_px[kept].T)
-        chance = log_nfa(gap, float(height * width), PARAMETER_COUNT[model] // 2, radius)[0]
+        chance = log_nfa(gap, float(height * width), points_that_fix(model), radius)[0]
     return PaperFit(
         estimate.map,
         chance,

@@ -20,6 +20,7 @@ from geodelreg.geo.crs import map_points
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.geotiff.atomic import staged
 from geodelreg.product.motion import metres_per_unit
+from geodelreg.product.pixels import geotiff_on
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Alignment, Outcome
@@ -55,14 +56,12 @@ def write_grid(alignment: Alignment, path: Path, overwrite: bool = False) -> Non
     at = apply_affine(step, np.stack([columns, rows], axis=-1)).reshape(-1, 2)
     metres = metres_per_unit(source, apply_affine(source.transform, at.mean(axis=0)))
     data = displacement(alignment, at, metres).reshape(height, width, len(BANDS))
-    profile = {"driver": "GTiff", "height": height, "width": width, "count": len(BANDS)}
+    profile = geotiff_on(Grid(source.transform @ step, (height, width), source.crs_wkt))
+    profile |= {"count": len(BANDS), "dtype": "float64", "compress": "DEFLATE", "predictor": 3}
     with (
         staged(path, overwrite=overwrite) as out,
-        rasterio.open(
-            out, "w", **profile, dtype="float64", crs=source.crs_wkt,
-            transform=source.transform @ step, compress="DEFLATE", predictor=3,
-        ) as dataset,
-    ):  # fmt: skip
+        rasterio.open(out, "w", **profile) as dataset,
+    ):
         dataset.write(np.moveaxis(data, -1, 0))
         dataset.descriptions = BANDS
         dataset.units = ("metre", "metre", "pixel", "pixel", "pixel")

@@ -39,7 +39,7 @@ from geodelreg.product.common_grid import (
     recipe_of,
     target_grid,
 )
-from geodelreg.product.pixels import Validity
+from geodelreg.product.pixels import Validity, geotiff_on
 from geodelreg.product.scratch import scratch_folder
 from geodelreg.product.warp import warped_onto
 from geodelreg.values.raster import Float32Array, Grid
@@ -365,15 +365,9 @@ def _mark(data: NDArray[Any], valid: NDArray[np.bool_], nodata: float) -> None:
 
 
 def _profile(sharp: Any, grid: Grid, nodata: float | None) -> dict[str, Any]:
-    height, width = grid.shape
-    return {
-        "driver": "GTiff",
-        "height": height,
-        "width": width,
+    return geotiff_on(grid) | {
         "count": sharp.count,
         "dtype": sharp.dtypes[0],
-        "crs": grid.crs_wkt,
-        "transform": grid.transform,
         "nodata": nodata,
         "tiled": True,
         "blockxsize": _BLOCK_PX,
@@ -381,7 +375,6 @@ def _profile(sharp: Any, grid: Grid, nodata: float | None) -> dict[str, Any]:
         "compress": "DEFLATE",
         "predictor": 3 if np.dtype(sharp.dtypes[0]).kind == "f" else 2,
         "zlevel": 1,  # sharpened noise hardly packs better, at five times the time
-        "bigtiff": "IF_SAFER",
         "photometric": "MINISBLACK",
         "interleave": "pixel",
     }

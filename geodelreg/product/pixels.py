@@ -54,6 +54,19 @@ class Validity:
         return cls(nodata=math.nan) if is_float else cls()
 
 
+def geotiff_on(grid: Grid) -> dict[str, Any]:
+    """How a GeoTIFF is made that lies on a grid."""
+    height, width = grid.shape
+    return {
+        "driver": "GTiff",
+        "height": height,
+        "width": width,
+        "crs": grid.crs_wkt,
+        "transform": grid.transform,
+        "bigtiff": "IF_SAFER",
+    }
+
+
 def profile_of(view: Any, grid: Grid, validity: Validity) -> dict[str, Any]:
     """How a GeoTIFF of a raster's pixels is made on a grid."""
     from rasterio.enums import ColorInterp
@@ -64,22 +77,15 @@ def profile_of(view: Any, grid: Grid, validity: Validity) -> dict[str, Any]:
         (ColorInterp.red, ColorInterp.green, ColorInterp.blue): "RGB",
         (ColorInterp.palette,): None,
     }.get(view.colorinterp[:3], "MINISBLACK")
-    height, width = grid.shape
-    return {
-        "driver": "GTiff",
-        "height": height,
-        "width": width,
+    return geotiff_on(grid) | {
         "count": view.count,
         "dtype": view.dtypes[0],
-        "crs": grid.crs_wkt,
-        "transform": grid.transform,
         "nodata": validity.nodata,
         "tiled": "YES",
         "blockxsize": str(_BLOCK_PX),
         "blockysize": str(_BLOCK_PX),
         "compress": "DEFLATE",
         "predictor": predictor or "1",
-        "bigtiff": "IF_SAFER",
         "interleave": view.interleaving.value if view.interleaving else "pixel",
         **({"photometric": photometric} if photometric else {}),
     }

@@ -19,6 +19,7 @@ from geodelreg.errors import (
     UnsupportedGeoreferenceError,
 )
 from geodelreg.geotiff.environment import gdal_failures, gdal_session
+from geodelreg.product.pixels import geotiff_on
 from geodelreg.raster.inputs import Opened
 
 _STEP_PX = 1024
@@ -64,18 +65,11 @@ def file_of(raster: Opened, path: Path) -> None:
     from rasterio.crs import CRS
 
     source, grid = raster.dataset, raster.grid()
-    height, width = grid.shape
-    profile = {
-        "driver": "GTiff",
-        "height": height,
-        "width": width,
+    profile = geotiff_on(grid) | {
         "count": source.count,
         "dtype": _type(source.dtypes),
-        "crs": grid.crs_wkt,
-        "transform": grid.transform,
         "nodata": source.nodatavals[0],
         "tiled": True,
-        "bigtiff": "IF_SAFER",
         "photometric": "MINISBLACK",
     }
     try:

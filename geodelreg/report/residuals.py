@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geodelreg.fine.layers import ELSEWHERE
+from geodelreg.geo.maps.kriging import distances
 from geodelreg.report.frame import Frame
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
@@ -62,10 +63,10 @@ def _neighbours(points: TiePoints, at: FloatArray) -> tuple[IntArray, FloatArray
     rows = max(1, _DISTANCES // len(some))
     for start in range(0, len(at), rows):
         part = slice(start, start + rows)
-        squared = ((at[part, None] - points.reference_px[some]) ** 2).sum(axis=-1)
-        order = np.argpartition(squared, count - 1, axis=1)[:, :count]
+        apart = distances(at[part], points.reference_px[some])
+        order = np.argpartition(apart, count - 1, axis=1)[:, :count]
         near[part] = some[order]
-        distance[part] = np.sqrt(np.take_along_axis(squared, order, axis=1).max(axis=1))
+        distance[part] = np.take_along_axis(apart, order, axis=1).max(axis=1)
     return near, distance
 
 
