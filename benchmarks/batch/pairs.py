@@ -38,10 +38,10 @@ def write_pairs(folder: Path, count: int, seed: int = 0) -> Path:
         for number in range(1, count + 1):
             column, row = (int(n) for n in rng.integers(0, pan.width - PAN_SIDE + 1, 2))
             names = f"ms_{number}.tif", f"pan_{number}.tif"
-            _crop(pan, folder / names[1], (column, row), PAN_SIDE)
+            crop(pan, folder / names[1], (column, row), PAN_SIDE)
             start = (min(int(column / ratio), ms.width - MS_SIDE),
                      min(int(row / ratio), ms.height - MS_SIDE))  # fmt: skip
-            _crop(ms, folder / names[0], start, MS_SIDE)
+            crop(ms, folder / names[0], start, MS_SIDE)
             rows.append((*names, f"out/{number}.tif"))
     manifest = folder / "pairs.csv"
     with manifest.open("w", encoding="utf-8", newline="") as file:
@@ -49,7 +49,8 @@ def write_pairs(folder: Path, count: int, seed: int = 0) -> Path:
     return manifest
 
 
-def _crop(raster: rasterio.DatasetReader, path: Path, start: tuple[int, int], side: int) -> None:
+def crop(raster: rasterio.DatasetReader, path: Path, start: tuple[int, int], side: int) -> None:
+    """Write a square window of a raster, where it lies."""
     window = Window(*start, side, side)
     profile = {**raster.profile, "width": side, "height": side, "tiled": False,
                "transform": raster.transform @ Affine.translation(*start)}  # fmt: skip

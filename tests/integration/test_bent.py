@@ -12,9 +12,9 @@ import pytest
 import rasterio
 from affine import Affine
 from numpy.typing import NDArray
-from rasterio.windows import Window
 
 import geodelreg
+from benchmarks.batch.pairs import SAMPLE, crop
 from benchmarks.gate.bent_cases import BentPair
 from benchmarks.gate.distortions import (
     Tear,
@@ -34,7 +34,6 @@ from geodelreg.values.result import CheckOutcome
 
 SHAPE = (640, 640)
 SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=2.0)
-SAMPLE = Path(__file__).parents[2] / "sample_tiles"
 CLOUDY = replace(SPEC, name="cloudy 1", variant="clouds")
 
 
@@ -250,20 +249,13 @@ def test_a_band_that_looks_unlike_the_others_is_not_called_misaligned(
     start: tuple[int, int], tmp_path: Path
 ) -> None:
     ms, pan = tmp_path / "ms.tif", tmp_path / "pan.tif"
-    crop(SAMPLE / "pan.tif", pan, start, 440)
-    crop(SAMPLE / "ms.tif", ms, (start[0] // 4, start[1] // 4), 110)
+    with rasterio.open(SAMPLE / "pan.tif") as whole:
+        crop(whole, pan, start, 440)
+    with rasterio.open(SAMPLE / "ms.tif") as whole:
+        crop(whole, ms, (start[0] // 4, start[1] // 4), 110)
     alignment = geodelreg.align(ms, pan)
     assert alignment.verdict.accepted
     assert not any("bands do not agree" in warning for warning in alignment.warnings)
-
-
-def crop(source: Path, target: Path, start: tuple[int, int], side: int) -> None:
-    with rasterio.open(source) as raster:
-        window = Window(*start, side, side)
-        transform = raster.transform @ Affine.translation(*start)
-        how = {"count": raster.count, "dtype": "uint16", "crs": raster.crs, "transform": transform}
-        with rasterio.open(target, "w", "GTiff", side, side, **how) as out:
-            out.write(raster.read(window=window))
 
 
 def bands_apart(folder: Path, shift: tuple[float, float]) -> Made:
