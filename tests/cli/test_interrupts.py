@@ -18,8 +18,9 @@ pytestmark = pytest.mark.skipif(
 )
 
 HOLD_A_TEMPORARY = """
-import signal, sys, tempfile, time
+import os, signal, sys, tempfile, time, weakref
 import click
+class Watched: pass
 # what a background job or nohup ignores ends the process again
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -31,6 +32,8 @@ import geodelreg_cli.main as main
 def hold(folder):
     with tempfile.TemporaryDirectory(dir=folder):
         print("ready", flush=True)
+        if len(sys.argv) > 2:
+            weakref.finalize(Watched(), os.kill, os.getpid(), int(sys.argv[2]))
         time.sleep(60)
 
 main.COMMANDS["hold"] = ("__main__", "")
@@ -73,6 +76,22 @@ def test_a_signal_in_mid_work_removes_temporaries(
     _, stderr = process.communicate(timeout=30)
     assert process.returncode == code
     assert stderr.strip() == f"geodelreg: {message}"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_meets_a_callback_is_not_lost(
+    tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    """Python drops what a weak reference's callback raises: the process would run on."""
+    process = subprocess.run(
+        [sys.executable, "-c", HOLD_A_TEMPORARY, str(tmp_path), str(int(number))],
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert process.returncode == code
+    assert "Traceback" not in process.stderr
     assert list(tmp_path.iterdir()) == []
 
 
