@@ -14,10 +14,14 @@ CACHE_BYTES = 64_000_000
 
 
 @contextmanager
-def gdal_session(source: Path) -> Iterator[None]:
+def gdal_session(source: Path, threads: int | None = None) -> Iterator[None]:
     """Bound GDAL's block cache, use all cores, keep masks inside TIFFs and write no statistics.
 
-    The variable ``GDAL_NUM_THREADS`` counts more than the number of cores.
+    Parameters
+    ----------
+    source : Path
+    threads : int, optional
+        Of GDAL's own; without it what the variable ``GDAL_NUM_THREADS`` says, or all cores.
 
     Raises
     ------
@@ -31,7 +35,7 @@ def gdal_session(source: Path) -> Iterator[None]:
         cache = min(int(get_gdal_config("GDAL_CACHEMAX")), CACHE_BYTES)
     with rasterio.Env(
         GDAL_CACHEMAX=cache,
-        GDAL_NUM_THREADS=os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
+        GDAL_NUM_THREADS=threads or os.environ.get("GDAL_NUM_THREADS", "ALL_CPUS"),
         GDAL_TIFF_INTERNAL_MASK=True,
         GTIFF_IMPLICIT_JPEG_OVR=False,
     ):
@@ -41,6 +45,12 @@ def gdal_session(source: Path) -> Iterator[None]:
             raise RasterUnreadableError(
                 f"{source} cannot be read by GDAL: {error}", "Obtain the file again, or repair it."
             ) from error
+
+
+def thread_count() -> int:
+    """Threads that pay: the processor's cores, or what ``GDAL_NUM_THREADS`` says."""
+    asked = os.environ.get("GDAL_NUM_THREADS", "")
+    return max(1, int(asked)) if asked.isdecimal() else os.cpu_count() or 1
 
 
 def gdal_failures() -> tuple[type[Exception], ...]:

@@ -11,11 +11,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -29,6 +27,7 @@ from geodelreg.geotiff.atomic import staged
 from geodelreg.geotiff.environment import gdal_session
 from geodelreg.geotiff.rewrite import gdal_write, output_driver, user_creation
 from geodelreg.options import PansharpenOptions
+from geodelreg.product.brovey import Source, pansharpened_xml, tiles
 from geodelreg.product.common_grid import (
     Recipe,
     Sharpening,
@@ -46,7 +45,7 @@ from geodelreg.values.raster import Float32Array, Grid
 
 _BLOCK_PX = 512
 _TILE_PX = 1024
-"""Read together: a few blocks, all bands of which stay in GDAL's cache until all are read."""
+"""Sharpened together: a few blocks, all bands of which stay in GDAL's cache until all are read."""
 _SAMPLE_SIDE = 300
 """Of the decimated images that the weights are fitted on: 90 000 pixels determine a few numbers."""
 _SHARE_BEFORE_COG = 0.7
@@ -179,73 +178,6 @@ def write_pansharpened(
                     tell(1.0, "laying out the COG")
 
 
-def _pansharpened_xml(
-    what: Sharpening,
-    recipe: Recipe,
-    weights: Sequence[float],
-    options: PansharpenOptions,
-    names: Sequence[str | None],
-    tags: Mapping[str, str],
-) -> str:
-    """The VRT of the sharpened raster."""
-    items = "".join(
-        f'<MDI key="{escape(key)}">{escape(value)}</MDI>' for key, value in sorted(tags.items())
-    )
-    kinds = [_gdal_type(recipe.files[file], band) for file, band in what.bands]
-    depth = f"<BitDepth>{options.bit_depth}</BitDepth>" if options.bit_depth else ""
-    parts = [
-        '<VRTDataset subClass="VRTPansharpenedDataset">',
-        f"<Metadata>{items}</Metadata>" if items else "",
-        *(
-            f'<VRTRasterBand band="{number}" dataType="{kind}" '
-            'subClass="VRTPansharpenedRasterBand">'
-            f"<Description>{escape(name or '')}</Description></VRTRasterBand>"
-            for number, (name, kind) in enumerate(zip(names, kinds, strict=True), start=1)
-        ),
-        _mask_xml(recipe),
-        "<PansharpeningOptions><Algorithm>WeightedBrovey</Algorithm>",
-        "<AlgorithmOptions><Weights>",
-        ",".join(repr(float(weight)) for weight in weights),
-        "</Weights></AlgorithmOptions>",
-        "<Resampling>Nearest</Resampling>",
-        depth,
-        f"<PanchroBand>{_source_xml(*recipe.pan, recipe.folder)}</PanchroBand>",
-    ]
-    for number, (file, band) in enumerate(what.bands, start=1):
-        named = _source_xml(recipe.files[file], band, recipe.folder)
-        parts.append(f'<SpectralBand dstBand="{number}">{named}</SpectralBand>')
-    return "".join([*parts, "</PansharpeningOptions></VRTDataset>\n"])
-
-
-def _gdal_type(vrt: Path, band: int) -> str:
-    """GDAL's name for the type of a band of a virtual raster."""
-    found = ElementTree.parse(vrt).findall("VRTRasterBand")[band - 1]
-    return found.get("dataType", "Byte")
-
-
-def _source_xml(path: Path, band: int | str, folder: Path) -> str:
-    relative = path.parent == folder
-    name = path.name if relative else str(path)
-    if not relative and not name.startswith("/vsi"):
-        name = str(path.absolute())
-    return (
-        f'<SourceFilename relativeToVRT="{int(relative)}">{escape(name)}</SourceFilename>'
-        f"<SourceBand>{band}</SourceBand>"
-    )
-
-
-def _mask_xml(recipe: Recipe) -> str:
-    """Valid where every input is; the product of masks that are 0 where there is nothing."""
-    sources = "".join(
-        f"<SimpleSource>{_source_xml(path, source, recipe.folder)}</SimpleSource>"
-        for path, source in recipe.covers
-    )
-    kind = 'subClass="VRTSourcedRasterBand">'
-    if len(recipe.covers) > 1:
-        kind = 'subClass="VRTDerivedRasterBand"><PixelFunctionType>mul</PixelFunctionType>'
-    return f'<MaskBand><VRTRasterBand dataType="Byte" {kind}{sources}</VRTRasterBand></MaskBand>'
-
-
 def _write_vrt(
     what: Sharpening,
     out: Path,
@@ -263,7 +195,17 @@ def _write_vrt(
         )
     recipe = recipe_of(what, out, grid, options.resampling)
     names = _descriptions(what)
-    out.write_text(_pansharpened_xml(what, recipe, weights, options, names, tags), encoding="utf-8")
+    text = pansharpened_xml(
+        _spectral(what, recipe),
+        Source(*recipe.pan),
+        weights,
+        bit_depth=options.bit_depth,
+        names=names,
+        tags=tags,
+        covers=[Source(*cover) for cover in recipe.covers],
+        folder=recipe.folder,
+    )
+    out.write_text(text, encoding="utf-8")
     with open_raster(out) as dataset:  # GDAL takes it
         dataset.read(1, window=((0, 1), (0, 1)))
     folder = Path(os.path.realpath(target)).parent
@@ -307,37 +249,43 @@ def _write_tiff(
     from rasterio.windows import Window
 
     recipe = recipe_of(what, lazy, grid, options.resampling)
-    names = _descriptions(what)
-    lazy.write_text(_pansharpened_xml(what, recipe, weights, options, names, {}), encoding="utf-8")
+    spectral = _spectral(what, recipe)
+    with open_raster(spectral[0].path) as dataset:
+        dtype = np.dtype(dataset.dtypes[int(spectral[0].band) - 1])
+    nodata = _nodata(what, dtype, options)
+    profile = _profile(len(spectral), dtype, grid, nodata) | {
+        key.lower(): value for key, value in user_creation(options).items()
+    }
     height, width = grid.shape
-    with open_raster(lazy) as sharp, ExitStack() as stack:
-        nodata = _nodata(what, sharp, options)
-        profile = _profile(sharp, grid, nodata) | {
-            key.lower(): value for key, value in user_creation(options).items()
-        }
-        covers = [(stack.enter_context(open_raster(p)), source) for p, source in recipe.covers]
-        with rasterio.open(draft, "w", **profile) as dataset:
-            dataset.descriptions = names
-            dataset.update_tags(**tags)
-            corners = list(product(range(0, height, _TILE_PX), range(0, width, _TILE_PX)))
-            for number, (top, left) in enumerate(corners, start=1):
-                size = min(_TILE_PX, width - left), min(_TILE_PX, height - top)
-                window = Window(left, top, *size)
-                data = sharp.read(window=window)
-                cover = [covered(file, source, window) for file, source in covers]
-                valid = np.logical_and.reduce(cover)
-                if nodata is not None:
-                    _mark(data, valid, nodata)
-                else:
-                    dataset.write_mask(valid, window=window)
-                dataset.write(data, window=window)
-                progress(number / len(corners), "sharpening")
+    corners = list(product(range(0, height, _TILE_PX), range(0, width, _TILE_PX)))
+    windows = [
+        Window(left, top, min(_TILE_PX, width - left), min(_TILE_PX, height - top))
+        for top, left in corners
+    ]
+    with (
+        gdal_session(what.reference, threads=1),  # the tiles have threads of their own
+        rasterio.open(draft, "w", **profile) as dataset,
+        tiles(recipe, spectral, weights, options.bit_depth, windows) as sharpened,
+    ):
+        dataset.descriptions = _descriptions(what)
+        dataset.update_tags(**tags)
+        for number, (window, data, valid) in enumerate(sharpened, start=1):
+            if nodata is not None:
+                _mark(data, valid, nodata)
+            else:
+                dataset.write_mask(valid, window=window)
+            dataset.write(data, window=window)
+            progress(number / len(windows), "sharpening")
 
 
-def _nodata(what: Sharpening, sharp: Any, options: PansharpenOptions) -> float | None:
+def _spectral(what: Sharpening, recipe: Recipe) -> list[Source]:
+    """The bands to sharpen, on the grid."""
+    return [Source.of(recipe.files[file], band) for file, band in what.bands]
+
+
+def _nodata(what: Sharpening, kind: np.dtype[Any], options: PansharpenOptions) -> float | None:
     """No-data value as asked for; else that of the first MS file, if the sharpened type has it."""
     asked, declared = options.nodata, what.sources[0].nodata
-    kind = np.dtype(sharp.dtypes[0])
     if asked is None:
         return None if declared is None or not _holds(kind, declared) else float(declared)
     if not _holds(kind, asked):
@@ -364,16 +312,16 @@ def _mark(data: NDArray[Any], valid: NDArray[np.bool_], nodata: float) -> None:
     data[:, ~valid] = nodata
 
 
-def _profile(sharp: Any, grid: Grid, nodata: float | None) -> dict[str, Any]:
+def _profile(count: int, dtype: np.dtype[Any], grid: Grid, nodata: float | None) -> dict[str, Any]:
     return geotiff_on(grid) | {
-        "count": sharp.count,
-        "dtype": sharp.dtypes[0],
+        "count": count,
+        "dtype": dtype,
         "nodata": nodata,
         "tiled": True,
         "blockxsize": _BLOCK_PX,
         "blockysize": _BLOCK_PX,
         "compress": "DEFLATE",
-        "predictor": 3 if np.dtype(sharp.dtypes[0]).kind == "f" else 2,
+        "predictor": 3 if dtype.kind == "f" else 2,
         "zlevel": 1,  # sharpened noise hardly packs better, at five times the time
         "photometric": "MINISBLACK",
         "interleave": "pixel",
