@@ -122,6 +122,7 @@ def align_pair(
     heard: list[Claim] = []
     looked = 0.0
     report(_OPENED, "reading")
+    Thread(target=import_module, args=("numpy.random",)).start()  # the evidence draws samples
     for seen, guess in pair.timings.each("search", _guesses(pair)):
         report(_FOUND + looked / 4, "refining")
         logger.info("guess from %s: %s", guess.images.scope.name, _listed(guess.counts))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -55,16 +56,14 @@ def read_overview(pair: Pair, scope: Scope) -> Overview:
     finds more.
     """
     gsd_m = working_gsd_m(pair, scope)
-    with pair.timings("read"):
-        source = pair.source.read(
-            pair.source_bands, scope.source, _shape(scope.source, pair.source_gsd_m, gsd_m)
-        )
-        reference = pair.reference.read(
-            [pair.options.pan_band],
-            scope.reference,
-            _shape(scope.reference, pair.reference_gsd_m, gsd_m),
-        )
-    return Overview(source, reference[0], scope)
+    shapes = (
+        _shape(scope.source, pair.source_gsd_m, gsd_m),
+        _shape(scope.reference, pair.reference_gsd_m, gsd_m),
+    )
+    with pair.timings("read"), ThreadPoolExecutor(1) as aside:
+        source = aside.submit(pair.source.read, pair.source_bands, scope.source, shapes[0])
+        reference = pair.reference.read([pair.options.pan_band], scope.reference, shapes[1])
+        return Overview(source.result(), reference[0], scope)
 
 
 def _shape(window: Window, gsd_m: tuple[float, float], target_m: float) -> tuple[int, int]:

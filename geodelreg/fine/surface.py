@@ -272,9 +272,22 @@ def _two_taps(at: Float32Array) -> tuple[Float32Array, Float32Array, Float32Arra
     base = np.floor(at)
     f = at - base
     square = f * f
-    # six times the weights of the first two and the last two of the four spline coefficients
-    low = _SIXTHS - 1 + ((2 * f - 3) * f - 3) * f
-    high = _SIXTHS - low
-    first = base - 1 + ((3 * f - _SIXTHS) * square + 4) / low
-    second = base + 1 + square * f / high
-    return first, second, low / np.float32(_SIXTHS)
+    # six times the weights of the first two and the last two of the four spline coefficients, in
+    # place: most of the time would go to memory for each term
+    low = 2 * f
+    for term in (-3, -3):
+        low += term
+        low *= f
+    low += _SIXTHS - 1
+    first = 3 * f
+    first -= _SIXTHS
+    first *= square
+    first += 4
+    first /= low
+    first += base - 1
+    second = square
+    second *= f
+    second /= _SIXTHS - low
+    second += base + 1
+    low /= np.float32(_SIXTHS)
+    return first, second, low

@@ -19,7 +19,7 @@ from geodelreg.fit.models import points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
 from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
-from geodelreg.judge.in_place import area_evidence
+from geodelreg.judge.in_place import AreaEvidence, area_evidence
 from geodelreg.judge.repeated import proof_without_repeated
 from geodelreg.judge.rival import Rival, rival_correlation
 from geodelreg.judge.verdict import Evidence
@@ -56,19 +56,20 @@ def gather(
         accuracy = measure(part, fitted.points, fitted.selection, before, after)
         return accuracy, rival_correlation(wide)
 
+    def in_place() -> AreaEvidence:
+        where = (part, refined.tiles, correction, refined.tuning, refined.size)
+        few = area_evidence(*where, few=True)
+        return few if few.log_chance <= _SURE_LOG_CHANCE else area_evidence(*where, few=False)
+
+    enough = points_that_fix(fitted.selection.estimate.model)
     # where MS is coarser, the tiles still hold the last pass's surfaces for all of this to share
-    where = (part, refined.tiles, correction, refined.tuning, refined.size)
     with ThreadPoolExecutor(pair.threads) as pool:
-        whole = pool.submit(overlaid)
+        whole, places = pool.submit(overlaid), pool.submit(in_place)
+        repeats = pool.submit(proof_without_repeated, refined, correction, enough)
         bands = find_bands(guess, refined, correction, pool)
         apart = bands_apart(bands, pair)
         told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
-        enough = points_that_fix(fitted.selection.estimate.model)
-        repeated = pool.submit(proof_without_repeated, refined, correction, enough)
-        area = area_evidence(*where, few=True)
-        if area.log_chance > _SURE_LOG_CHANCE:
-            area = area_evidence(*where, few=False)
-        accuracy, rival = whole.result()
+        (accuracy, rival), area, repeated = whole.result(), places.result(), repeats.result()
     turn_deg, scale = _turn_and_scale(pair, correction)
     return accuracy, Evidence(
         points=accuracy.kept,
@@ -79,8 +80,8 @@ def gather(
         disagreement_px=fitted.disagreement_px,
         rival=rival.elsewhere,
         shading=rival.beside,
-        repeated=repeated.result().log_chance,
-        repeated_words=repeated.result().words,
+        repeated=repeated.log_chance,
+        repeated_words=repeated.words,
         shift_px=float(np.hypot(*pair.move_px(correction, pair.source_centre)[0])),
         rotation_deg=abs(turn_deg),
         scale=scale,

@@ -131,7 +131,7 @@ class TiePoints:
     @property
     def sigma_px(self) -> FloatArray:
         """(M, 2) float64, standard deviation along PAN columns and rows, in PAN pixels."""
-        return np.sqrt(np.stack([self.covariance_px2[:, 0, 0], self.covariance_px2[:, 1, 1]], 1))
+        return np.asarray(np.sqrt(self.covariance_px2.diagonal(axis1=1, axis2=2)))
 
 
 _NOWHERE: FloatArray = np.empty((0, 2))
