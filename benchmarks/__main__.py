@@ -20,6 +20,7 @@ COMMANDS = {
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
     "speed": ("benchmarks.peers.speed", "wall time beside a half-size SIFT script, in turn"),
+    "stages": ("benchmarks.peers.stages", "where the time of one alignment goes"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),
     "scale": ("benchmarks.scale.run", "time and memory against the size of the rasters"),
     "wald": ("benchmarks.sharpening.wald", "what alignment is worth to pansharpening"),
