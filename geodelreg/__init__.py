@@ -13,7 +13,7 @@ from geodelreg.version import __version__
 if TYPE_CHECKING:
     from geodelreg import errors
     from geodelreg.alignment import Alignment
-    from geodelreg.api import align, check
+    from geodelreg.api import align, check, refit
     from geodelreg.applying import apply
     from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
     from geodelreg.product.check import Check
@@ -43,6 +43,7 @@ __all__ = [
     "errors",
     "export_gcps",
     "pansharpen",
+    "refit",
     "revert",
     "write",
     "write_displacement",
@@ -62,6 +63,7 @@ _HOMES = {
     "check": "geodelreg.api",
     "export_gcps": "geodelreg.writing",
     "pansharpen": "geodelreg.sharpen",
+    "refit": "geodelreg.api",
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
     "write_displacement": "geodelreg.writing",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -23,16 +22,15 @@ from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fine.per_band import match_each_band
 from geodelreg.fine.settle import settle
-from geodelreg.fit.choice import Fitted, HeldOut, Selection, half_disagreement, select_model
-from geodelreg.fit.estimate import Estimate
-from geodelreg.fit.field import halves_apart, held_out_errors
+from geodelreg.fit.choice import Fitted, half_disagreement, select_for
+from geodelreg.fit.field import halves_apart, selection_of
 from geodelreg.fit.models import Frame, points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import (
     clouds_in_the_way,
-    is_worthwhile,
     judge,
+    moves_pair,
     nothing_agrees,
     passes,
     too_few_for_a_field,
@@ -41,8 +39,7 @@ from geodelreg.judge.verdict import (
 from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import bands_warning, unheard_bands, warnings_of
 from geodelreg.options import BEYOND_A_HEADER, AlignOptions
-from geodelreg.pair import LATTICE, Pair, Progress, make_pair, overlap_corners, roles
-from geodelreg.values.maps import PixelMap
+from geodelreg.pair import Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status, TiePoints
 from geodelreg.values.raster import StatusArray, WindowReader
 from geodelreg.values.result import Accuracy, BandMap, Solution
@@ -50,9 +47,6 @@ from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
 
-_NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
-_TILT_PX = 0.1
-"""Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _FEWEST_POINTS = 4
 _BENT_TRIES = 2  # of the guesses that one affine could not make good
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
@@ -205,12 +199,7 @@ def fit_patches(
     points = last.points.take(kept)
     if len(points) < _FEWEST_POINTS:
         return None
-    negligible = _NEGLIGIBLE_PX / pair.pan_px_per_source_px
-    frame, model = Frame.of(pair), pair.options.model
-    if model == "field":
-        model = "affine"  # to start from
-    tilt = math.inf if pair.options.north_up else _TILT_PX / pair.pan_px_per_source_px
-    selection = select_model(points, frame, pair.source_lattice(2), model, negligible, tilt)
+    selection = select_for(pair, points)
     estimate = selection.estimate
     status[kept[~estimate.inlier]] = Status.RESIDUAL
     tied = tie_points(part, last.matched, estimate.map, status)
@@ -276,7 +265,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
             if refined.part.ms_is_template:
                 bands = match_each_band(refined, fitted.map, model, options.band_model)
         notes += unheard_bands(pair, bands)
-    moves = any(_moves(pair, one) for one in (fitted.map, *(band.map for band in bands)))
+    moves = any(moves_pair(pair, one) for one in (fitted.map, *(band.map for band in bands)))
     if options.model == "field" and model != "field" and passes(reasons):
         in_the_way = clouds > LEAST_SHARE
         why = clouds_in_the_way(clouds) if in_the_way else too_few_for_a_field(accuracy.kept)
@@ -294,14 +283,6 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         search=guess.search,
         bands=bands,
     )
-
-
-def _moves(pair: Pair, correction: PixelMap) -> bool:
-    """True of a correction that is worth to be applied."""
-    spots = pair.source_lattice(LATTICE)
-    move_px = np.hypot(*pair.move_px(correction, spots).T)
-    sigma_px = correction.sigma_at(spots) * pair.pan_px_per_source_px
-    return is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
 
 
 def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
@@ -329,24 +310,18 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         settled = settle(refined, whole.field or fitted.map)
         if settled is None:
             return refined, fitted
-        refined, field, size = settled.refined, settled.fit.field, len(settled.fit.field.source)
+        refined, field = settled.refined, settled.fit.field
         tied = tie_points(refined.part, settled.matched, field, settled.status)
-        distance2 = settled.fit.distance2[settled.fit.inlier]
-        none, all_of_them = np.empty(0), np.ones(size, dtype=np.bool_)
-        estimate = Estimate(
-            "field", field, none, none, Frame.of(pair), field.kernel.nugget_px2, all_of_them,
-            distance2,
-        )  # fmt: skip
-        check = HeldOut(held_out_errors(field), distance2)
+        selection = selection_of(settled.fit, Frame.of(pair))
         apart_px = pair.pan_px_per_source_px * halves_apart(field)
         # a field follows its points: those that it has not seen say what chance would do
         unseen = tied.residual_px.copy()
-        unseen[tied.kept] = pair.pan_px_per_source_px * check.residual_px
+        unseen[tied.kept] = pair.pan_px_per_source_px * selection.check.residual_px
         log_nfa = patches_log_nfa(
             refined.part, replace(tied, residual_px=unseen), points_that_fix("field")
         )
     counts = guess.counts | _patch_counts(settled.matched, tied)
-    return refined, Fitted(Selection(estimate, check), tied, counts, log_nfa, apart_px)
+    return refined, Fitted(selection, tied, counts, log_nfa, apart_px)
 
 
 def _load_scipy() -> None:

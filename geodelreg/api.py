@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Unpack
 
@@ -23,10 +24,12 @@ from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, part_of
 from geodelreg.product.check import BandCheck, Check, band_check
+from geodelreg.product.gcps.given import given_points
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.raster.reader import RasterReader, check_band, open_raster
+from geodelreg.refit_pair import refit_pair
 from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution
 from geodelreg.values.timings import Timings
 
@@ -46,22 +49,34 @@ class _Rasters:
     timings: Timings
     fill_notes: tuple[str, ...]
 
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the files."""
+        ms, pan = self.ms, self.pan
+        files = [one for one in (self.source, self.reference) if not one.in_memory]
+        unsure = [unsettled(Path(path)) for one in files for path in one.paths]
+        notes = (*self.fill_notes, ms.block_note, pan.block_note, *unsure, *mask_warnings(ms, pan))
+        return tuple(dict.fromkeys(note for note in notes if note))
+
 
 @contextmanager
 def _open(
     source: AnyRaster | Sequence[AnyRaster],
-    reference: AnyRaster,
+    reference: AnyRaster | None,
     options: AlignOptions,
     masks: Sequence[AnyMask],
     pan_masks: Sequence[AnyMask],
 ) -> Iterator[_Rasters]:
+    """The rasters; without a reference MS stands for it."""
     timings, allow = Timings(), options.allow
     with ExitStack() as stack:
         with timings("open"):
-            ms = stack.enter_context(open_raster(source, [*options.masks, *masks], allow=allow))
-            pan = stack.enter_context(
-                open_raster(reference, [*options.pan_masks, *pan_masks], allow=allow)
+            ms = pan = stack.enter_context(
+                open_raster(source, [*options.masks, *masks], allow=allow)
             )
+            if reference is not None:
+                pan = stack.enter_context(
+                    open_raster(reference, [*options.pan_masks, *pan_masks], allow=allow)
+                )
             if options.band:
                 check_band(ms, options.band)
             check_band(pan, options.pan_band)
@@ -156,6 +171,86 @@ def align(
             f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
             + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),
             alignment.verdict.remedy,
+            alignment,
+        )
+    return alignment
+
+
+def refit(
+    points: str | PathLike[str],
+    source: AnyRaster | Sequence[AnyRaster],
+    reference: AnyRaster | None = None,
+    options: AlignOptions | None = None,
+    *,
+    format: str | None = None,  # noqa: A002 - the field's word
+    snap: bool = False,
+    mask: AnyMask | Sequence[AnyMask] | None = None,
+    pan_mask: AnyMask | Sequence[AnyMask] | None = None,
+    progress: Progress | None = None,
+    **knobs: Unpack[AlignKnobs],
+) -> Alignment:
+    """Fit the correction to control points of a file, which a person may have edited.
+
+    Who edits the points answers for them: nothing is searched, and the gate is not asked.
+
+    Parameters
+    ----------
+    points : path
+        As `export_gcps` writes them, in any of its formats.
+    source : raster or sequence of rasters
+        The MS raster that the points were made for, as for `align`, with its original header.
+    reference : raster, optional
+        The PAN raster.  Without it, what is called PAN pixels are pixels of MS.
+    options : AlignOptions, optional
+        Those that tell of a search or of its gate have no meaning here.  ``auto`` takes no field.
+    format : str, optional
+        One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
+    snap : bool
+        Measure points that were placed by hand where PAN shows what MS does; points that were
+        drawn, without a pixel of MS, are looked for where the others say.
+    mask, pan_mask : mask or sequence of masks, optional
+        As for `align`.
+    progress : callable, optional
+    **knobs
+        Fields of `AlignOptions`, which replace those of `options`.
+
+    Returns
+    -------
+    Alignment
+        To be written as that of `align`.
+
+    Raises
+    ------
+    PointsError
+        The points do not determine the model, or are those of another raster.
+    GcpFormatError
+        The file cannot be read.
+    AlignmentRefusedError
+        The correction folds the ground, or is larger than allowed.
+    GeodelregError
+        Its other kinds, for bad input.
+    """
+    options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
+    if snap and reference is None:
+        raise UsageError("`snap=True` measures points on PAN, and none was given", "Name PAN.")
+    if options.per_band:
+        raise UsageError("`per_band=True` has no meaning for points", "Drop it.")
+    file = Path(points)
+    with _open(source, reference, options, masks, pan_masks) as rasters:
+        pan = None if reference is None else rasters.pan
+        given = given_points(file, format, rasters.ms.grid, None if pan is None else pan.grid)
+        pair, solution = refit_pair(
+            rasters.ms, pan, given, options, snap, progress, rasters.timings
+        )
+        read = Input((str(file),), rasters.ms.grid, (fingerprint(file),), in_memory=True)
+        alignment = _alignment(rasters, pair, solution, rasters.notes())
+        truth = read if pan is None else rasters.reference
+        alignment = replace(alignment, points=read, reference=truth)
+    if not alignment.verdict.accepted:
+        failed = [r.message for r in alignment.verdict.reasons if not r.passed]
+        raise AlignmentRefusedError(
+            f"the correction through the points of {file} is refused: {'; '.join(failed)}",
+            "Look for points in the wrong place, or use a simpler `model`.",
             alignment,
         )
     return alignment
@@ -258,11 +353,7 @@ def _examine(
         pair, solution = align_pair(ms, pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, ms, pan) from error
-    files = [one for one in (rasters.source, rasters.reference) if not one.in_memory]
-    unsure = [unsettled(Path(path)) for one in files for path in one.paths]
-    notes = tuple(note for note in (ms.block_note, pan.block_note, *unsure) if note)
-    notes = (*rasters.fill_notes, *notes, *mask_warnings(ms, pan))
-    alignment = _alignment(rasters, pair, solution, notes)
+    alignment = _alignment(rasters, pair, solution, rasters.notes())
     return alignment, measure_misalignment(pair, solution)
 
 

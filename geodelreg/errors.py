@@ -128,6 +128,10 @@ class GcpFormatError(GeodelregError):
     """A GCP file cannot be read, or its format is unknown."""
 
 
+class PointsError(GeodelregError):
+    """Points that were given do not determine the correction asked for, or are no points of MS."""
+
+
 class ReportError(GeodelregError):
     """A report or a displacement is none, of another version or a refusal, or of other rasters."""
 

@@ -35,7 +35,17 @@ FLAGS = {
 }
 """Flags that GDAL's users know by another name than the knob's, or that are functions in Python."""
 _OPTIONS = (AlignOptions, WriteOptions, BatchOptions, PansharpenOptions)
-_ARGUMENTS = {"force", "ledger", "mask", "out_root", "pan_mask", "points", "resume", "retry"}
+_ARGUMENTS = {
+    "force",
+    "ledger",
+    "mask",
+    "out_root",
+    "pan_mask",
+    "points",
+    "resume",
+    "retry",
+    "snap",
+}
 """Of functions, with flags of the same name."""
 NAMES = frozenset(
     {*FLAGS, *_ARGUMENTS, *(field.name for kind in _OPTIONS for field in fields(kind))}

@@ -70,6 +70,11 @@ def write(
     check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
     check_is_file(alignment)
+    if options.warp and options.warp_grid == "pan" and not alignment.has_pan:
+        raise UsageError(
+            "`warp_grid='pan'` needs PAN, and the correction was fitted to points alone",
+            "Refit with PAN, or use `warp_grid='ms'`.",
+        )
     if alignment.options.per_band and not options.warp:
         from geodelreg.writing_bands import write_bands
 
@@ -299,6 +304,7 @@ def inputs_of(alignment: Alignment) -> list[Path]:
     """Whatever an alignment was read from."""
     rasters = [one for one in (alignment.source, alignment.reference) if not one.in_memory]
     names = [path for one in rasters for path in one.paths]
+    names += alignment.points.paths if alignment.points else ()
     return input_paths([*names, *masks_of(alignment)], alignment.options.allow)
 
 

@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from geodelreg.errors import AlignmentRefusedError, UsageError, shown
-from geodelreg.flags import as_typed
-from geodelreg.masking import parse_mask
-from geodelreg.options import AlignOptions, WriteOptions, check_header_holds, one_header
-from geodelreg_cli.console import log_steps, log_timings, progress_bar
-from geodelreg_cli.figure import kind_option
+from geodelreg.options import AlignOptions, WriteOptions, one_header
 from geodelreg_cli.options import (
-    GCP_FORMAT,
     SectionCommand,
     SectionOption,
     add_options,
     build,
-    flag,
     is_default,
-    knob_option,
     knob_options,
     ms_and_pan,
     run_options,
     start_run,
 )
+from geodelreg_cli.results import Request, carries_all, output_params, request_of, run
 
 if TYPE_CHECKING:
-    from geodelreg.values.result import Alignment
+    from geodelreg.alignment import Alignment
+    from geodelreg.pair import Progress
 
-OUTPUT, CORRECTION, FORMAT = "Output", "How to align", "How OUT is written"
-FILE = click.Path(path_type=Path)
+CORRECTION, FORMAT = "How to align", "How OUT is written"
 
 EPILOG = """\
 Examples:
@@ -70,106 +60,10 @@ Exit codes: 0 done, 1 failed, 2 wrong usage, 3 refused (nothing written, the rea
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What the user asked for, checked for contradictions."""
-
-    sources: tuple[str, ...]
-    reference: str
-    output: Path | None
-    in_place: bool
-    dry_run: bool
-    gcps: tuple[Path, ...]
-    gcp_format: str | None
-    points: str
-    reports: tuple[Path, ...]
-    displacement: Path | None
-    figure: Path | None
-    figure_kind: str
-    json: bool
-    quiet: bool
-    options: AlignOptions
-    write_options: WriteOptions
-
-
 def align_params() -> list[SectionOption]:
     """Options of ``align``, in the order of the help."""
     return [
-        flag(
-            "-o",
-            "--output",
-            type=FILE,
-            metavar="OUT",
-            section=OUTPUT,
-            help="Corrected MS raster; with several MS files, the folder for them: all or none of "
-            "them appear.",
-        ),
-        flag(
-            "--in-place",
-            is_flag=True,
-            section=OUTPUT,
-            help="Correct the header of MS itself, whatever its size (of all MS files or none); "
-            "keeps a record to undo it.",
-        ),
-        flag(
-            "--dry-run",
-            is_flag=True,
-            section=OUTPUT,
-            help="Find and report the correction, write no raster.",
-        ),
-        knob_option(WriteOptions, "overwrite", OUTPUT),
-        flag(
-            "--gcps",
-            type=FILE,
-            multiple=True,
-            metavar="FILE",
-            section=OUTPUT,
-            help="Write the tie points as ground control points; the format follows the extension: "
-            ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .vrt, "
-            ".pts ENVI; - writes to stdout. May be repeated.",
-        ),
-        flag(
-            "--gcp-format",
-            type=GCP_FORMAT,
-            section=OUTPUT,
-            help="Format of --gcps, when the extension does not say it.",
-        ),
-        flag(
-            "--points",
-            type=click.Choice(("kept", "all")),
-            default="kept",
-            show_default=True,
-            section=OUTPUT,
-            help="Tie points in --gcps; all has the rejected ones, too (QGIS, GeoJSON).",
-        ),
-        flag(
-            "--report",
-            type=FILE,
-            multiple=True,
-            metavar="FILE",
-            section=OUTPUT,
-            help="Write everything that was found out; also after a refusal. .html is a page to "
-            "look at, with before and after (needs the report extra); else JSON. - writes JSON to "
-            "stdout. May be repeated.",
-        ),
-        flag(
-            "--displacement",
-            type=FILE,
-            metavar="FILE.tif",
-            section=OUTPUT,
-            help="Write how far every place moves, as a GeoTIFF: metres east and north, PAN pixels "
-            "right and down, standard error.",
-        ),
-        flag(
-            "--figure",
-            type=FILE,
-            metavar="FILE.png",
-            section=OUTPUT,
-            help="Draw the result as PNG, SVG or PDF; also after a refusal (needs matplotlib, the "
-            "report extra). - is stdout.",
-        ),
-        kind_option("--figure-kind", OUTPUT),
-        flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
+        *output_params(),
         *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
         *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
         *run_options(),
@@ -189,204 +83,22 @@ def align(rasters: tuple[str, ...], **given: Any) -> None:
     """
     start_run(given)
     request = _request(rasters, given)
-    _run(request, _check_outputs(request))
+    source = request.sources[0] if len(request.sources) == 1 else request.sources
+
+    def find(progress: Progress) -> Alignment:
+        import geodelreg
+
+        return geodelreg.align(source, rasters[-1], request.options, progress=progress)
+
+    run(request, find)
 
 
 def _request(rasters: tuple[str, ...], given: dict[str, Any]) -> Request:
     sources, reference = ms_and_pan(rasters)
-    ways = [given["output"] is not None, given["in_place"], given["dry_run"]]
-    if sum(ways) != 1:
-        what = "Say where the result goes" if not any(ways) else "The result goes to one place"
-        raise click.UsageError(f"{what}: one of -o OUT, --in-place, --dry-run.")
-    write_options = build(WriteOptions, given)
-    if given["in_place"] and write_options not in (WriteOptions(), WriteOptions(overwrite=True)):
-        raise click.UsageError(
-            "--in-place corrects the header and nothing else: drop --of, --co, --georef, "
-            "--strip-rpc and --warp, or write to -o OUT."
-        )
     options = build(AlignOptions, given)
-    if not given["dry_run"] and not _carries_all(write_options):
-        check_header_holds("field" if options.on_local == "field" else options.model)
-    if _carries_all(write_options) and is_default("on_local"):
-        options = replace(options, on_local="field")
-    if options.per_band and given["in_place"]:
+    request = request_of(sources, reference, given, options)
+    if options.per_band and request.in_place:
         raise one_header()
-    if given["gcp_format"] is not None and not given["gcps"]:
-        raise click.UsageError("--gcp-format needs --gcps FILE.")
-    return Request(
-        sources=sources,
-        reference=reference,
-        output=given["output"],
-        in_place=given["in_place"],
-        dry_run=given["dry_run"],
-        gcps=given["gcps"],
-        gcp_format=given["gcp_format"],
-        points=given["points"],
-        reports=given["report"],
-        displacement=given["displacement"],
-        figure=given["figure"],
-        figure_kind=given["figure_kind"],
-        json=given["json"],
-        quiet=given["quiet"],
-        options=options,
-        write_options=write_options,
-    )
-
-
-def _carries_all(options: WriteOptions) -> bool:
-    """True of outputs that hold what no geotransform does."""
-    return options.warp or options.georef == "gcps"
-
-
-def _check_outputs(request: Request) -> list[Path]:
-    """Refuse what cannot be written, after settling what a killed run has left beside it.
-
-    Returns
-    -------
-    list of Path
-        Everything that is read, down to the sources of VRTs and side files.
-    """
-    from geodelreg.geotiff.atomic import tidy
-    from geodelreg.geotiff.targets import STDOUT, Inputs
-    from geodelreg.report.output import check_report
-    from geodelreg_cli.outputs import check_gcp_formats, check_targets, raster_targets
-
-    if request.gcp_format is None:
-        check_gcp_formats(request.gcps)
-    moves = request.displacement
-    if moves == STDOUT:
-        raise click.UsageError("--displacement -: a raster cannot be written to standard output.")
-    side_files = [path for path in (*request.gcps, *request.reports, moves, request.figure) if path]
-    masks = (*request.options.masks, *request.options.pan_masks)
-    inputs = [*request.sources, request.reference, *(parse_mask(mask).path for mask in masks)]
-    try:
-        apart = request.options.per_band and not request.write_options.warp
-        rasters = []
-        if request.output is not None:
-            rasters = raster_targets(request.sources, request.output, apart)
-        written = [*rasters, *(path for path in side_files if path != STDOUT)]
-        tidy([*written, *(map(Path, request.sources) if request.in_place else ())])
-        check_targets(
-            inputs,
-            [*rasters, *side_files, *([STDOUT] if request.json else [])],
-            request.write_options.overwrite,
-            request.output if len(request.sources) > 1 or apart else None,
-            rasters,
-        )
-        for path in request.reports:
-            check_report(path)
-        if request.figure is not None:
-            from geodelreg.product.figures import check_drawable
-
-            check_drawable(request.figure)
-    except UsageError as error:
-        raise click.UsageError(as_typed(str(error))) from error
-    if not written:
-        return []
-    from geodelreg.writing import input_paths
-
-    read = input_paths(inputs, request.options.allow)
-    known = Inputs(read)
-    for path in written:
-        known.check(path)
-    return read
-
-
-def _run(request: Request, inputs: Sequence[Path]) -> None:
-    """Align, then write what was asked for, all or nothing; a refusal leaves the reports only."""
-    import geodelreg
-    from geodelreg.geotiff.atomic import together
-    from geodelreg.product.report import summary_text
-
-    source = request.sources[0] if len(request.sources) == 1 else request.sources
-    try:
-        with progress_bar(request.quiet) as bar:
-            alignment = geodelreg.align(
-                source, request.reference, request.options, progress=log_steps(bar)
-            )
-    except AlignmentRefusedError as refusal:
-        if refusal.alignment is not None:
-            with together(inputs=lambda: inputs):
-                _draw(refusal.alignment, request)
-                _write_texts(_reports(refusal.alignment, request), request)
-            log_timings(refusal.alignment)
-            if not request.quiet:
-                click.echo(_step_counts(refusal.alignment), err=True)
-        raise
-    reports = _reports(alignment, request)  # of the inputs as they are: --in-place changes one
-    with together(inputs=lambda: inputs):
-        _draw(alignment, request)
-        _write(alignment, request)
-        _write_texts(reports, request)
-    log_timings(alignment)
-    if not request.quiet:
-        click.echo(shown(_named(request)), err=True)
-        click.echo(as_typed(summary_text(alignment, request.write_options)), err=True)
-        click.echo(_step_counts(alignment), err=True)
-        click.echo(shown(_written(request)), err=True)
-
-
-def _named(request: Request) -> str:
-    """The inputs, in one line."""
-    more = f" and {len(request.sources) - 1} more" if len(request.sources) > 1 else ""
-    return f"MS {request.sources[0]}{more}, PAN {request.reference}"
-
-
-def _written(request: Request) -> str:
-    """The outputs, in one line."""
-    paths = [
-        request.output, *request.gcps, *request.reports, request.displacement, request.figure
-    ]  # fmt: skip
-    names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
-    if request.in_place:
-        names = f"the header of MS{', ' if names else ''}{names}"
-    return f"Written: {names}" if names else "Written: nothing (dry run)"
-
-
-def _step_counts(alignment: Alignment) -> str:
-    """Points that survive each step, as in the paper's "112 → 97 → 91"."""
-    counts = alignment.solution.step_counts.items()
-    return "Points: " + " → ".join(f"{count} ({step})" for step, count in counts)
-
-
-def _write(alignment: Alignment, request: Request) -> None:
-    """Write the raster, then the control points."""
-    import geodelreg
-
-    overwrite = request.write_options.overwrite
-    warnings: list[str] = []
-    if request.in_place:
-        warnings = geodelreg.write_in_place(alignment)
-    elif request.output is not None:
-        warnings = geodelreg.write(alignment, request.output, request.write_options)
-    for warning in (*alignment.warnings, *warnings):
-        logging.getLogger(__name__).warning("warning: %s", warning)
-    if request.displacement is not None:
-        geodelreg.write_displacement(alignment, request.displacement, overwrite)
-    for path in request.gcps:
-        geodelreg.export_gcps(alignment, path, request.gcp_format, overwrite, points=request.points)
-
-
-def _draw(alignment: Alignment, request: Request) -> None:
-    """The figure, of the inputs as they are."""
-    if request.figure is not None:
-        from geodelreg.report.figures import draw_figure
-
-        overwrite = request.write_options.overwrite
-        draw_figure(alignment, request.figure_kind, request.figure, overwrite)
-
-
-def _reports(alignment: Alignment, request: Request) -> list[tuple[Path, str]]:
-    """Where reports go, and their texts."""
-    from geodelreg.geotiff.targets import STDOUT
-    from geodelreg.report.output import report_text
-
-    paths = [*request.reports, *([STDOUT] if request.json else [])]
-    return [(path, report_text(alignment, path)) for path in paths]
-
-
-def _write_texts(texts: Sequence[tuple[Path, str]], request: Request) -> None:
-    from geodelreg.geotiff.atomic import write_text_atomically
-
-    for path, text in texts:
-        write_text_atomically(path, text, request.write_options.overwrite)
+    if carries_all(request.write_options) and is_default("on_local"):
+        return replace(request, options=replace(options, on_local="field"))
+    return request

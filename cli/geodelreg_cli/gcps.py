@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,6 @@ from geodelreg_cli.options import (
 )
 
 if TYPE_CHECKING:
-    from geodelreg.values.points import Gcp
     from geodelreg.values.raster import Grid
 
 EPILOG = """\
@@ -79,7 +77,7 @@ def gcps(
     keep_to(allow)
     from geodelreg.door.opening import allowing
     from geodelreg.geotiff.atomic import together
-    from geodelreg.product.gcps import GcpContext, read_gcps, write_gcps
+    from geodelreg.product.gcps import GcpContext, in_crs_of, read_gcps, write_gcps
     from geodelreg.raster.reader import open_raster
     from geodelreg.writing import input_paths
 
@@ -94,22 +92,9 @@ def gcps(
         reference_path=reference or "",
     )
     points, crs_wkt = read_gcps(source, from_format, context)
-    if crs_wkt is not None:
-        points = _in_crs(points, crs_wkt, context.source.crs_wkt)
+    points = in_crs_of(context.source, points, crs_wkt)
     rasters = [raster] if reference is None else [raster, reference]
     with allowing(allow), together(inputs=lambda: [source, *input_paths(rasters, allow)]):
         write_gcps(target, points, to_format, context=context, overwrite=overwrite)
     if not quiet:
         click.echo(f"{shown(str(target))}: {len(points)} points", err=True)
-
-
-def _in_crs(points: tuple[Gcp, ...], from_wkt: str, to_wkt: str) -> tuple[Gcp, ...]:
-    import numpy as np
-
-    from geodelreg.geo.crs import map_points
-
-    ground = np.array([(point.x, point.y) for point in points], dtype=np.float64).reshape(-1, 2)
-    moved = map_points(ground, from_wkt, to_wkt)
-    return tuple(
-        replace(point, x=x, y=y) for point, (x, y) in zip(points, moved.tolist(), strict=True)
-    )

@@ -36,6 +36,7 @@ COMMANDS = {
     "gcps": ("geodelreg_cli.gcps", "Convert ground control points between formats."),
     "info": ("geodelreg_cli.info", "Tell grid, CRS, footprint, bands and provenance of rasters."),
     "pansharpen": ("geodelreg_cli.pansharpen", "Align MS, then sharpen it with PAN."),
+    "refit": ("geodelreg_cli.refit", "Correct MS by control points that you have edited."),
     "report": ("geodelreg_cli.report", "Make a page to look at out of a JSON report."),
     "revert": ("geodelreg_cli.revert", "Undo align --in-place."),
 }

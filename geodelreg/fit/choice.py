@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from geodelreg.fit.estimate import (
     weighted_fit,
 )
 from geodelreg.fit.models import MODEL_ORDER, NORTH_UP, Frame, fitted_map
+from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import TINY, FloatArray, IntArray
@@ -26,6 +28,9 @@ _INSIDE = 1 - 1e-9  # the last point is in the last block
 _SIGNIFICANT_T = 2.5  # a chance of 1 % or so with as many blocks
 _NORTH_UP_LOSS = 0.04  # unexplained: ablate
 _LOSS = 0.01  # unexplained: ablate
+_NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
+_TILT_PX = 0.1
+"""Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _LEAST_PREDICTED = 0.5
 _DOUBT_SIGMAS = 2.0
 
@@ -190,6 +195,20 @@ def select_model(
             estimate = robust_fit(name, points, frame)
             return Selection(estimate, held_out(name, points, estimate), neglected)
     return Selection(full, check_full, neglected)
+
+
+def select_for(pair: Pair, points: Observations) -> Selection:
+    """`select_model` as the options of a pair ask; a field starts from an affine.
+
+    Parameters
+    ----------
+    pair : Pair
+    points : Observations
+    """
+    asked, frame, ratio = pair.options, Frame.of(pair), pair.pan_px_per_source_px
+    model = "affine" if asked.model == "field" else asked.model
+    tilt = math.inf if asked.north_up else _TILT_PX / ratio
+    return select_model(points, frame, pair.source_lattice(2), model, _NEGLIGIBLE_PX / ratio, tilt)
 
 
 def _as_good(simple: HeldOut, full: HeldOut, loss: float) -> bool:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fit.choice import FOLDS, fold_numbers, spatial_blocks
-from geodelreg.fit.estimate import Observations
+from geodelreg.fit.choice import FOLDS, HeldOut, Selection, fold_numbers, spatial_blocks
+from geodelreg.fit.estimate import Estimate, Observations
+from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel, distances, solve_axis
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
@@ -195,6 +196,23 @@ def held_out_errors(field: FieldMap) -> FloatArray:
         if out.any() and (~out).sum() >= FEWEST_POINTS:
             error[out] = _without(field, out).forward(field.source[out]) - field.target[out]
     return error
+
+
+def selection_of(fit: FieldFit, frame: Frame) -> Selection:
+    """A fitted field as a model with its held-out errors, at the points that it stands on.
+
+    Parameters
+    ----------
+    fit : FieldFit
+    frame : Frame
+        Of MS.
+    """
+    field, distance2, none = fit.field, fit.distance2[fit.inlier], np.empty(0)
+    all_of_them = np.ones(len(field.source), dtype=np.bool_)
+    estimate = Estimate(
+        "field", field, none, none, frame, field.kernel.nugget_px2, all_of_them, distance2
+    )
+    return Selection(estimate, HeldOut(held_out_errors(field), distance2))
 
 
 def halves_apart(field: FieldMap) -> float:

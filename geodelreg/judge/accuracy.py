@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +30,17 @@ def measure(
     part: Roles, points: TiePoints, selection: Selection, before: Overlay, after: Overlay
 ) -> Accuracy:
     """Accuracy in PAN pixels and metres, at points the fit has not seen where it says check."""
+    return replace(
+        measure_points(part, points, selection),
+        e1_before=grey_rmse(before, part.ms_is_template),
+        e1_after=grey_rmse(after, part.ms_is_template),
+        ncc_before=correlation(before),
+        ncc_after=correlation(after),
+    )
+
+
+def measure_points(part: Roles, points: TiePoints, selection: Selection) -> Accuracy:
+    """What the points alone say of it; what needs the images is not known."""
     pair, kept = part.pair, points.kept
     correction = selection.estimate.map
     unmoved = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
@@ -52,10 +64,6 @@ def measure(
             floor,
         ),
         coverage=_coverage(part, points, correction),
-        e1_before=grey_rmse(before, part.ms_is_template),
-        e1_after=grey_rmse(after, part.ms_is_template),
-        ncc_before=correlation(before),
-        ncc_after=correlation(after),
         kept=int(kept.sum()),
         checked=int(np.isfinite(check_px).all(axis=1).sum()),
     )

@@ -70,7 +70,7 @@ def gather(
         apart = bands_apart(bands, pair)
         told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
         (accuracy, rival), area, repeated = whole.result(), places.result(), repeats.result()
-    turn_deg, scale = _turn_and_scale(pair, correction)
+    turn_deg, scale = turn_and_scale(pair, correction)
     return accuracy, Evidence(
         points=accuracy.kept,
         log_nfa=fitted.log_nfa,
@@ -134,7 +134,7 @@ def decimated(guess: Guess, refined: Refinement, dark: bool) -> tuple[Band, Band
     return template, finer, make_surface(finer, part.surface.grid, sigma)
 
 
-def _turn_and_scale(pair: Pair, correction: PixelMap) -> tuple[float, float]:
+def turn_and_scale(pair: Pair, correction: PixelMap) -> tuple[float, float]:
     """Rotation on the ground in degrees, and the larger of the stretch and its inverse."""
     metric = pair.metric
     linear = correction.linearise(pair.source_centre)[0, :, :2]

@@ -12,6 +12,8 @@ import numpy as np
 from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.fit.field import FEWEST_POINTS, MOST_STRAIN
 from geodelreg.options import AlignOptions
+from geodelreg.pair import LATTICE, Pair
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
 
@@ -136,20 +138,14 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     tuple of Reason
         The correction is believed when all passed.
     """
-    asked = (
-        ("max_shift", "≤", options.max_shift_px, "PAN px shift"),
-        ("max_rotation", "≤", options.max_rotation_deg, "deg rotation"),
-        ("max_scale", "≤", options.max_scale, "scale factor"),
-    )
     where = f": {evidence.words}" if evidence.words else ""
     which = f": {evidence.bands_words}" if evidence.bands_words else ""
     most_px = options.max_residual_px if options.on_local == "refuse" else None
-    strained = MOST_STRAIN if evidence.strain else None
     repeated = _MAX_LOG_TOGETHER if evidence.repeated is not None else None
     whole = (
         ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
         ("bands", "≤", MAX_BANDS_PX, f"PAN px at least between the places of two MS bands{which}"),
-        ("strain", "≤", strained, "strain of the field, which so steep would fold the ground"),
+        _strain_limit(evidence.strain),
         ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
         ("local", "≤", most_px, "PAN px RMS at least is left of the ground's bend"),
     )
@@ -163,12 +159,48 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         "local": evidence.residual_low_px,
     }
     reasons = []
-    for name, relation, limit, what in (*_LIMITS, *asked, *_LAST_LIMITS, *whole):
+    for name, relation, limit, what in (*_LIMITS, *_asked(options), *_LAST_LIMITS, *whole):
         if limit is not None and not (options.per_band and name in _OF_BANDS):
             apart_from = _APART_FROM[options.method == "delaunay"] if what.endswith("and") else ""
             words = f"{what} {apart_from}".rstrip()
             reasons.append(_reason(name, values[name], relation, limit, words))
     return tuple(reasons)
+
+
+def judge_motion(
+    shift_px: float, rotation_deg: float, scale: float, strain: float, options: AlignOptions
+) -> tuple[Reason, ...]:
+    """Hold a map that a person answers for against what was asked, and against folds.
+
+    Parameters
+    ----------
+    shift_px, rotation_deg, scale, strain
+        As in `Evidence`.
+    options : AlignOptions
+    """
+    values = {
+        "max_shift": shift_px, "max_rotation": rotation_deg, "max_scale": scale, "strain": strain
+    }  # fmt: skip
+    limits = [*_asked(options), _strain_limit(strain)]
+    return tuple(
+        _reason(name, values[name], relation, limit, what)
+        for name, relation, limit, what in limits
+        if limit is not None
+    )
+
+
+def _asked(options: AlignOptions) -> tuple[tuple[str, str, float | None, str], ...]:
+    return (
+        ("max_shift", "≤", options.max_shift_px, "PAN px shift"),
+        ("max_rotation", "≤", options.max_rotation_deg, "deg rotation"),
+        ("max_scale", "≤", options.max_scale, "scale factor"),
+    )
+
+
+def _strain_limit(strain: float) -> tuple[str, str, float | None, str]:
+    """Asked of a field alone."""
+    words = "strain of the field, which so steep would fold the ground"
+    return "strain", "≤", MOST_STRAIN if strain else None, words
 
 
 def passes(reasons: tuple[Reason, ...]) -> bool:
@@ -217,6 +249,14 @@ def is_worthwhile(move_px: FloatArray, sigma_px: FloatArray, tolerance_px: float
     """
     noise = np.hypot(sigma_px, SYSTEMATIC_PX)
     return bool((move_px > tolerance_px).any() or (move_px > SIGNIFICANCE * noise).any())
+
+
+def moves_pair(pair: Pair, correction: PixelMap) -> bool:
+    """True of a correction that is worth to be applied."""
+    spots = pair.source_lattice(LATTICE)
+    move_px = np.hypot(*pair.move_px(correction, spots).T)
+    sigma_px = correction.sigma_at(spots) * pair.pan_px_per_source_px
+    return is_worthwhile(move_px, sigma_px, pair.options.tolerance_px)
 
 
 def _reason(name: str, value: float, relation: str, limit: float, what: str) -> Reason:

@@ -128,14 +128,19 @@ class Whole:
         if not isinstance(field, FieldMap):
             return self
         near = shared_by_neighbours(points.source_px[points.kept], points.residual_px[points.kept])
-        places = np.concatenate([field.source, pair.source_lattice(_STRAIN_PLACES)])
-        strain = float(field.strain_at(places)[0].max())
+        strain = largest_strain(pair, field)
         return replace(self, residual=near, field=field, strain=strain)
 
     def under(self, pair: Pair, correction: PixelMap) -> Whole:
         """The same of another correction."""
         assert self.field is not None
         return replace(self, residual=_left(pair, self.field, correction))
+
+
+def largest_strain(pair: Pair, field: FieldMap) -> float:
+    """Of a field, at its points and over MS."""
+    places = np.concatenate([field.source, pair.source_lattice(_STRAIN_PLACES)])
+    return float(field.strain_at(places)[0].max())
 
 
 def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Whole:

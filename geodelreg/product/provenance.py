@@ -80,16 +80,18 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
         Sorted by name; input files without their folders.  What is not known has no tag.
     """
     correction, accuracy = alignment.correction, alignment.accuracy
-    source, reference = alignment.source, alignment.reference
+    source, reference, points = alignment.source, alignment.reference, alignment.points
     after = correction.corrected.to_gdal() if alignment.fits_a_header else ()
     tags = {
         "VERSION": __version__,
         "MS": "; ".join(Path(path).name for path in source.paths),
         "MS_FINGERPRINT": "; ".join(source.fingerprints) if all(source.fingerprints) else "",
-        "PAN": Path(reference.paths[0]).name,
-        "PAN_FINGERPRINT": reference.fingerprints[0],
+        "PAN": Path(reference.paths[0]).name if alignment.has_pan else "",
+        "PAN_FINGERPRINT": reference.fingerprints[0] if alignment.has_pan else "",
+        "POINTS": Path(points.paths[0]).name if points else "",
+        "POINTS_FINGERPRINT": points.fingerprints[0] if points else "",
         "MASKS": "; ".join(f"{Path(use.path).name} ({use.kind})" for use in alignment.masks),
-        "METHOD": alignment.options.method,
+        "METHOD": "points" if points else alignment.options.method,
         "MODEL": correction.model,
         "VERDICT": alignment.verdict.outcome.value,
         "GEOTRANSFORM_BEFORE": _numbers(correction.original.to_gdal()),

@@ -95,6 +95,7 @@ def _alignment(report: Mapping[str, Any]) -> Alignment:
         )
     source = _input(report["inputs"]["source"])
     verdict, warnings = report["verdict"], tuple(map(str, report["warnings"]))
+    points = report["inputs"].get("points")
     solution = Solution(
         model=str(report["found"]["model"]),
         map=_map(report["found"], source.grid.shape),
@@ -115,6 +116,7 @@ def _alignment(report: Mapping[str, Any]) -> Alignment:
         masks=tuple(map(_mask, report["masks"])),
         versions={str(k): str(v) for k, v in report["versions"].items()},
         timings_s={str(k): float(v) for k, v in report["timings_s"].items()},
+        points=None if points is None else _input(points),
     )
 
 

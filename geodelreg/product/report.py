@@ -22,7 +22,7 @@ from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Alignment, BandMap, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.5"
+SCHEMA_VERSION = "1.6"
 LATTICE = 17
 """Places along each axis where the standard error of the correction is listed."""
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
@@ -112,6 +112,8 @@ def plain(value: Any) -> Any:
 
 def _inputs(alignment: Alignment) -> dict[str, Any]:
     inputs = {"source": alignment.source, "reference": alignment.reference}
+    if alignment.points is not None:
+        inputs["points"] = alignment.points
     return {
         role: {
             "files": [_file(*file) for file in zip(of.paths, of.fingerprints, strict=True)],
@@ -240,7 +242,8 @@ def found_line(alignment: Alignment) -> str:
     motion = header_motion(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         return "Already aligned: the header needs no correction and stays as it is."
-    off = with_metres(motion.distance_px, motion.distance_m)
+    unit, truth = ("PAN px", "PAN") if alignment.has_pan else ("MS px", "the points")
+    off = with_metres(motion.distance_px, motion.distance_m, unit)
     (right, down), (width, height) = motion.shift_px, motion.scale
     parts = [
         f"{short(abs(right))} px {'right' if right >= 0 else 'left'}",
@@ -254,23 +257,23 @@ def found_line(alignment: Alignment) -> str:
     if alignment.correction.model == "affine":
         parts.append(f"shear {motion.shear_deg:+.4f}°")
     return (
-        f"Aligned: MS lay {off} off PAN; at its centre it moves {', '.join(parts)} "
+        f"Aligned: MS lay {off} off {truth}; at its centre it moves {', '.join(parts)} "
         f"(model {alignment.correction.model})."
     )
 
 
 def accuracy_line(alignment: Alignment) -> str:
     """How good the fit is, in one sentence."""
-    accuracy = alignment.accuracy
+    accuracy, unit = alignment.accuracy, "PAN px" if alignment.has_pan else "MS px"
     if not math.isfinite(accuracy.check_rmse_px):
         return f"{accuracy.kept} tie points; too few to measure the accuracy on points left out."
     text = (
         f"Accuracy at {accuracy.checked} check points: RMSE "
-        f"{with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)}, CE90 "
-        f"{with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m)}"
+        f"{with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m, unit)}, CE90 "
+        f"{with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m, unit)}"
     )
     if math.isfinite(accuracy.before_rmse_px):
-        text += f"; before: {short(accuracy.before_rmse_px)} PAN px"
+        text += f"; before: {short(accuracy.before_rmse_px)} {unit}"
     if math.isfinite(accuracy.coverage):
         text += f". They span {100 * accuracy.coverage:.0f} % of the overlap"
     return text + "."
@@ -323,9 +326,9 @@ def _refused_lines(alignment: Alignment) -> list[str]:
     ]
 
 
-def with_metres(px: float, m: float) -> str:
-    """A length in PAN pixels, and in metres where these are known."""
-    return f"{short(px)} PAN px" + (f" ({short(m)} m)" if math.isfinite(m) else "")
+def with_metres(px: float, m: float, unit: str = "PAN px") -> str:
+    """A length in pixels of PAN, and in metres where these are known."""
+    return f"{short(px)} {unit}" + (f" ({short(m)} m)" if math.isfinite(m) else "")
 
 
 def short(value: float) -> str:

@@ -49,6 +49,7 @@ STATUS = {
     Status.CORRELATION: "looks too different",
     Status.STAR: "matched, moves unlike its neighbours",
     Status.RESIDUAL: "matched, far from the fit",
+    Status.EXCLUDED: "not enabled",
 }
 
 _SILENT = (Status.TEXTURE, Status.CONVERGENCE, Status.CORRELATION)

@@ -93,6 +93,7 @@ class Status(IntEnum):
     CORRELATION = 9
     STAR = 10
     RESIDUAL = 11
+    EXCLUDED = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,6 +144,41 @@ NO_TIE_POINTS = TiePoints(
     status=np.empty(0, dtype=np.uint8),
     residual_px=_NOWHERE,
 )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenPoints:
+    """Points out of a file that a person may have edited, in MS pixels.
+
+    Attributes
+    ----------
+    file : str
+        For messages.
+    ids : tuple of str
+    source_px : (N, 2) float64
+        MS pixel; NaN of a point that was drawn, and whose pixel is to be looked for.
+    target_px : (N, 2) float64
+        The pixel by the original header, where the content belongs.
+    covariance_px2 : (N, 2, 2) float64
+        Of `target_px`, MS pixels squared; NaN of points that were placed by hand.
+    score : (N,) float64
+        Correlation; NaN where it is not known.
+    enabled : (N,) bool
+    status : (N,) uint8
+        Why those that are not enabled are not.
+    """
+
+    file: str
+    ids: tuple[str, ...]
+    source_px: FloatArray
+    target_px: FloatArray
+    covariance_px2: FloatArray
+    score: FloatArray
+    enabled: BoolArray
+    status: StatusArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
 
 
 @dataclass(frozen=True, slots=True)

@@ -284,6 +284,9 @@ class Alignment:
     masks : tuple of MaskUse
     versions, timings_s : dict
         Of everything that can change a result; wall time of the stages.
+    points : Input or None
+        File of the points that a refit was made to; where no PAN was given it is `reference`, too,
+        on the grid of MS.
     """
 
     source: Input
@@ -295,6 +298,12 @@ class Alignment:
     masks: tuple[MaskUse, ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    points: Input | None = None
+
+    @property
+    def has_pan(self) -> bool:
+        """False of a refit to points alone: pixels are then those of MS."""
+        return self.points is None or self.points.paths != self.reference.paths
 
     @property
     def tie_points(self) -> TiePoints:

@@ -18,7 +18,7 @@ import pytest
 import rasterio
 from affine import Affine
 
-from geodelreg import AlignOptions, Grid, __version__, align, errors
+from geodelreg import AlignOptions, Grid, __version__, align, errors, refit
 from geodelreg.batch import run
 from geodelreg.batch.job import Pair, Task
 from geodelreg.batch.supervisor import Child
@@ -80,6 +80,12 @@ def bands_of_two_crss(folder: Path) -> object:
 
 def text_file(folder: Path, name: str) -> Path:
     (folder / name).write_text("nothing of use")
+    return folder / name
+
+
+def points_file(folder: Path, name: str) -> Path:
+    """One point, which determines nothing."""
+    (folder / name).write_text("column,line,x,y\n1,2,500003,3999997\n")
     return folder / name
 
 
@@ -177,6 +183,10 @@ CASES = {
     errors.FileLockedError: Case(locked, ("out.txt",)),
     errors.GcpFormatError: Case(
         lambda folder: read_gcps(text_file(folder, "gcps.points")), ("gcps.points",)
+    ),
+    errors.PointsError: Case(
+        lambda folder: refit(points_file(folder, "points.csv"), raster(folder, "ms.tif")),
+        ("points.csv",),
     ),
     errors.CorrectionMisfitError: Case(
         lambda folder: stored(folder).check_share("mask.tif", 0.1), ("mask.tif", "report.json")

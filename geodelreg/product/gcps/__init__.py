@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +24,12 @@ from geodelreg.product.gcps.context import (
     Encoder,
     GcpContext,
     gcp_context,
+    ground_of,
     reading_order,
 )
+from geodelreg.product.gcps.facts import facts_of
 from geodelreg.values.points import Gcp, TiePoints
+from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment
 
 __all__ = [
@@ -35,6 +38,7 @@ __all__ = [
     "GcpFormat",
     "gcp_context",
     "gcps_from_alignment",
+    "in_crs_of",
     "read_gcps",
     "write_gcps",
 ]
@@ -80,7 +84,7 @@ def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp,
     ----------
     alignment : Alignment
     every : bool
-        Those of the rejected tie points, too, with what is known of each.
+        Those of the rejected tie points, too.
 
     Returns
     -------
@@ -109,26 +113,16 @@ def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp,
             y,
             info=_info(points, int(index)),
             enabled=bool(points.kept[index]),
-            facts=_facts(points, int(index)) if every else (),
+            facts=facts,
         )
-        for number, (index, (column, row), (x, y)) in enumerate(
-            zip(order, points.source_px[order].tolist(), ground.tolist(), strict=True), start=1
+        for number, (index, (column, row), (x, y), facts) in enumerate(
+            zip(
+                order, points.source_px[order].tolist(), ground.tolist(),
+                facts_of(alignment, order), strict=True,
+            ),
+            start=1,
         )
-    )
-
-
-def _facts(points: TiePoints, index: int) -> tuple[tuple[str, float | None], ...]:
-    """Numbers of one tie point, ``_px`` in PAN pixels; None where one is not known."""
-    (right, down), (across, along) = points.residual_px[index], points.sigma_px[index]
-    numbers = {
-        "residual_right_px": right,
-        "residual_down_px": down,
-        "sigma_right_px": across,
-        "sigma_down_px": along,
-        "correlation": points.score[index],
-    }
-    known = {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
-    return ("status", float(points.status[index])), *known.items()
+    )  # fmt: skip
 
 
 def _info(points: TiePoints, index: int) -> str:
@@ -193,6 +187,7 @@ def read_gcps(
     path: str | Path,
     format: str | None = None,  # noqa: A002 - the field's word
     context: GcpContext | None = None,
+    every: bool = False,
 ) -> Decoded:
     """Read GCPs.
 
@@ -203,6 +198,9 @@ def read_gcps(
         Key of `GCP_FORMATS`; by the extension (and first line, for ENVI) when not given.
     context : GcpContext, optional
         Grids that QGIS (``source``) and ENVI image-to-image files (both) refer to.
+    every : bool
+        Also those that are not enabled or were rejected, and those whose pixel of MS is not known
+        (NaN).
 
     Returns
     -------
@@ -222,10 +220,43 @@ def read_gcps(
     if format is None and name == "envi" and envi.is_image_to_map(text):
         name = "envi-map"
     try:
-        return _format(name).decode(text, context)
+        gcps, crs_wkt = _format(name).decode(text, context)
+        if not every:
+            gcps = tuple(gcp for gcp in gcps if gcp.enabled)
+            _check_pixels(gcps)
+        return gcps, crs_wkt
     except GcpFormatError as error:
         remedy = error.remedy or f"Correct the file, or name its format; {name} was read."
         raise GcpFormatError(f"{source}: {error.cause}", remedy) from error
+
+
+def in_crs_of(source: Grid, gcps: Sequence[Gcp], crs_wkt: str | None) -> tuple[Gcp, ...]:
+    """Points whose map coordinates are in the CRS that their file names, in that of MS.
+
+    Parameters
+    ----------
+    source : Grid
+        Of MS.
+    gcps, crs_wkt
+        As from `read_gcps`.
+
+    Raises
+    ------
+    CrsTransformError
+    """
+    if crs_wkt is None:
+        return tuple(gcps)
+    moved = map_points(ground_of(gcps), crs_wkt, source.crs_wkt).tolist()
+    return tuple(replace(gcp, x=x, y=y) for gcp, (x, y) in zip(gcps, moved, strict=True))
+
+
+def _check_pixels(gcps: Sequence[Gcp]) -> None:
+    nowhere = [gcp.id for gcp in gcps if not math.isfinite(gcp.column + gcp.row)]
+    if nowhere:
+        raise GcpFormatError(
+            f"point {nowhere[0]} lacks the pixel of MS, row and col",
+            "Fill it in, take the point out, or let geodelreg refit look for it (`snap`).",
+        )
 
 
 def _text(source: Path) -> str:

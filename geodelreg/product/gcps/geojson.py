@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.crs import map_points
@@ -16,11 +18,14 @@ from geodelreg.product.gcps.context import (
     crs_name,
     crs_wkt_of,
     ground_of,
-    numbers,
 )
+from geodelreg.product.gcps.features import Feature, fields_of_gcp, gcps_of
 from geodelreg.values.points import Gcp
+from geodelreg.values.raster import FloatArray
 
 _RECORD_SEPARATOR = "\x1e"
+_MOVED_DEG = 1e-7
+"""Seven decimals are what RFC 7946 advises and other programs round to: a centimetre."""
 
 
 def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
@@ -31,10 +36,8 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
     GcpFormatError
         If a point lies outside what its CRS can express.
     """
-    from rasterio.crs import CRS
-
     crs_wkt = context.source.crs_wkt
-    positions = map_points(ground_of(gcps), crs_wkt, CRS.from_epsg(4326).to_wkt())
+    positions = map_points(ground_of(gcps), crs_wkt, _wgs84())
     nowhere = [
         gcp.id
         for gcp, position in zip(gcps, positions.tolist(), strict=True)
@@ -59,17 +62,7 @@ def _feature(gcp: Gcp, longitude: float, latitude: float, crs: str) -> dict[str,
         "type": "Feature",
         "id": gcp.id,
         "geometry": {"type": "Point", "coordinates": [longitude, latitude, gcp.z]},
-        "properties": {
-            "id": gcp.id,
-            "info": gcp.info,
-            "row": gcp.row,
-            "col": gcp.column,
-            "x": gcp.x,
-            "y": gcp.y,
-            "z": gcp.z,
-            "crs": crs,
-            **dict(gcp.facts),
-        },
+        "properties": fields_of_gcp(gcp) | {"crs": crs},
     }
 
 
@@ -81,13 +74,51 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     GcpFormatError
         If the text is no such GeoJSON or its features disagree on the CRS.
     """
-    properties = [_properties(feature) for feature in _features(text)]
-    properties = [item for item in properties if not item.get("status")]  # 0 is kept
+    features = _features(text)
+    properties = [_properties(feature) for feature in features]
     names = {str(item["crs"]) for item in properties if item.get("crs")}
     if len(names) > 1:
         raise GcpFormatError("the features have different CRSs")
-    gcps = tuple(_gcp(item, index) for index, item in enumerate(properties, start=1))
-    return gcps, crs_wkt_of(names.pop()) if names else None
+    crs_wkt = crs_wkt_of(names.pop()) if names else None
+    around = crs_wkt or (context.source.crs_wkt if context else _wgs84())
+    places = np.array([_position(feature) for feature in features]).reshape(-1, 2)
+    return gcps_of(list(_placed(properties, places, around))), crs_wkt
+
+
+def _placed(
+    properties: Sequence[Mapping[str, Any]], places: FloatArray, crs_wkt: str
+) -> Iterator[Feature]:
+    """Features with their geometries in the CRS of their coordinates."""
+    inside = map_points(places, _wgs84(), crs_wkt)
+    said = np.array([[_coordinate(item, axis) for axis in "xy"] for item in properties])
+    claimed = map_points(said.reshape(-1, 2), crs_wkt, _wgs84())
+    for item, (x, y), apart in zip(
+        properties, inside.tolist(), np.abs(places - claimed).max(axis=1).tolist(), strict=True
+    ):
+        known = math.isfinite(x) and math.isfinite(y)
+        yield Feature(item, (x, y) if known else None, known and apart > _MOVED_DEG)
+
+
+def _coordinate(item: Mapping[str, Any], axis: str) -> float:
+    try:
+        return float(item[axis])
+    except (KeyError, TypeError, ValueError):
+        return math.nan
+
+
+def _position(feature: Any) -> tuple[float, float]:
+    """Longitude and latitude of a feature's point; NaN where it has none."""
+    try:
+        longitude, latitude, *_ = feature["geometry"]["coordinates"]
+        return float(longitude), float(latitude)
+    except (KeyError, TypeError, ValueError):
+        return math.nan, math.nan
+
+
+def _wgs84() -> str:
+    from rasterio.crs import CRS
+
+    return str(CRS.from_epsg(4326).to_wkt())
 
 
 def _features(text: str) -> list[Any]:
@@ -110,13 +141,3 @@ def _properties(feature: Any) -> dict[str, Any]:
     if not isinstance(properties, dict):
         raise GcpFormatError("it is not a collection of GeoJSON features with properties")
     return properties
-
-
-def _gcp(item: dict[str, Any], index: int) -> Gcp:
-    missing = [name for name in ("row", "col", "x", "y") if name not in item]
-    if missing:
-        raise GcpFormatError(f"feature {index} lacks the properties {', '.join(missing)}")
-    texts = [str(item[name]) for name in ("col", "row", "x", "y")]
-    column, row, x, y = numbers(texts, index)
-    z = numbers([str(item.get("z") or 0.0)], index)[0]
-    return Gcp(str(item.get("id", index)), column, row, x, y, z, str(item.get("info") or ""))

@@ -56,7 +56,7 @@ def _residuals(gcps: Sequence[Gcp], context: GcpContext) -> FloatArray:
 
 
 def decode(text: str, context: GcpContext | None) -> Decoded:
-    """Enabled points of a ``.points`` file and its CRS, when it names one.
+    """Points of a ``.points`` file and its CRS, when it names one.
 
     Raises
     ------
@@ -74,25 +74,22 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
         crs_wkt = crs_wkt_of(lines.pop(0)[len(_CRS_PREFIX.strip()) :].strip())
     first = len(text.splitlines()) - len(lines) + 2
     rows = [
-        _enabled_row(line, number)
-        for number, line in enumerate(lines[1:], start=first)
-        if line.strip()
+        _row(line, number) for number, line in enumerate(lines[1:], start=first) if line.strip()
     ]
-    points = np.array([row for row in rows if row], dtype=np.float64).reshape(-1, 4)
-    pixels = apply_affine(~context.source.transform, points[:, 2:])
+    points = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    pixels = apply_affine(~context.source.transform, points[:, 2:4])
     gcps = tuple(
-        Gcp(str(index), column, row, x, y)
-        for index, ((column, row), (x, y)) in enumerate(
-            zip(pixels.tolist(), points[:, :2].tolist(), strict=True), start=1
+        Gcp(str(index), column, row, x, y, enabled=enable != 0)
+        for index, ((column, row), (x, y, _, _, enable)) in enumerate(
+            zip(pixels.tolist(), points.tolist(), strict=True), start=1
         )
     )
     return gcps, crs_wkt
 
 
-def _enabled_row(line: str, number: int) -> list[float] | None:
+def _row(line: str, number: int) -> list[float]:
+    """Four coordinates, and 0 where the point is not enabled."""
     fields = line.split("," if "," in line else "\t")
     if len(fields) < 4:
         raise GcpFormatError(f"line {number}: fewer than 4 columns")
-    if len(fields) > 4 and numbers(fields[4:5], number) == [0.0]:
-        return None
-    return numbers(fields[:4], number)
+    return numbers([*fields[:5], "1"][:5], number)

@@ -1,4 +1,7 @@
-"""CSV of ``gdal raster edit --gcp @FILE`` (GDAL ≥ 3.12), fields found by name."""
+"""CSV of ``gdal raster edit --gcp @FILE`` (GDAL ≥ 3.12), fields found by name.
+
+What more is known of the points stands in fields after GDAL's, which it does not look at.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from pathlib import Path
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers
+from geodelreg.product.gcps.facts import fields_of, read_facts
 from geodelreg.values.points import Gcp
 
 _FIELDS = ("id", "info", "column", "line", "x", "y", "z")
@@ -19,10 +23,14 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
     """Text of a CSV file with a header line."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(_FIELDS)
-    for gcp in gcps:
+    known = list(map(fields_of, gcps))
+    more = list(dict.fromkeys(name for fields in known for name in fields))
+    writer.writerow((*_FIELDS, *more))
+    for gcp, fields in zip(gcps, known, strict=True):
         values = (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z)
-        writer.writerow((gcp.id, gcp.info, *map(exact, values)))
+        facts = (fields.get(name) for name in more)
+        texts = ("" if value is None else repr(value) for value in facts)
+        writer.writerow((gcp.id, gcp.info, *map(exact, values), *texts))
     return buffer.getvalue()
 
 
@@ -52,5 +60,7 @@ def _decoded(reader: csv.DictReader[str]) -> Decoded:
         row = {name: record[original] or "" for name, original in names.items()}
         column, line, x, y = numbers([row[name] for name in _REQUIRED], reader.line_num)
         z = numbers([row["z"]], reader.line_num)[0] if row.get("z") else 0.0
-        gcps.append(Gcp(row.get("id") or str(index), column, line, x, y, z, row.get("info", "")))
+        name, info = row.get("id") or str(index), row.get("info", "")
+        facts, enabled = read_facts(row, f"line {reader.line_num}")
+        gcps.append(Gcp(name, column, line, x, y, z, info, enabled, facts))
     return tuple(gcps), None

@@ -1,0 +1,120 @@
+"""Numbers of a control point beside its place: written where a format has fields, and read back.
+
+Lengths that end in ``_px`` are PAN pixels.  `SIGMA_X`, `SIGMA_Y` (units of the map) and
+`ERROR_CORRELATION` are the covariance of the map position: with them a fit weighs the points anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from geodelreg.errors import GcpFormatError
+from geodelreg.geo.affine import affine_matrix
+from geodelreg.geo.maps.header import header_map
+from geodelreg.geo.maps.smooth import Inverse
+from geodelreg.values.points import Gcp
+from geodelreg.values.raster import FloatArray, Grid, IntArray
+from geodelreg.values.result import Alignment
+
+ENABLE, STATUS = "enable", "status"
+SIGMA_X, SIGMA_Y, ERROR_CORRELATION = "sigma_x", "sigma_y", "error_correlation"
+COVARIANCE = (SIGMA_X, SIGMA_Y, ERROR_CORRELATION)
+NAMES = (
+    STATUS, "residual_right_px", "residual_down_px", "sigma_right_px", "sigma_down_px",
+    "correlation", *COVARIANCE,
+)  # fmt: skip
+Facts = tuple[tuple[str, float | None], ...]
+
+
+def facts_of(alignment: Alignment, order: IntArray) -> list[Facts]:
+    """Facts of some tie points; None where one is not known."""
+    points = alignment.tie_points
+    sigma = _covariance_facts(
+        map_covariance(
+            points.reference_px[order], points.covariance_px2[order],
+            alignment.source.grid, alignment.reference.grid,
+        )
+    )  # fmt: skip
+    rows = np.column_stack(
+        [
+            points.status[order], points.residual_px[order], points.sigma_px[order],
+            points.score[order], sigma,
+        ]
+    )  # fmt: skip
+    return [
+        tuple((n, v if math.isfinite(v) else None) for n, v in zip(NAMES, row, strict=True))
+        for row in rows.tolist()
+    ]
+
+
+def map_covariance(
+    reference_px: FloatArray, covariance_px2: FloatArray, source: Grid, reference: Grid
+) -> FloatArray:
+    """(N, 2, 2) covariances of PAN pixels, as those of map positions in the CRS of MS."""
+    _, in_source = Inverse(header_map(source, reference)).carry(reference_px, covariance_px2)
+    unit = affine_matrix(source.transform)[:, :2]
+    return np.asarray(np.einsum("ij,njk,lk->nil", unit, in_source, unit))
+
+
+def _covariance_facts(covariance: FloatArray) -> FloatArray:
+    sigma = np.sqrt(covariance[:, (0, 1), (0, 1)])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        together = covariance[:, 0, 1] / (sigma[:, 0] * sigma[:, 1])
+    return np.column_stack([sigma, together])
+
+
+def covariance_of(gcp: Gcp, file: str) -> FloatArray:
+    """(2, 2) covariance of the map position, units of the map squared; NaN where it is not known.
+
+    Raises
+    ------
+    GcpFormatError
+        The facts are those of no point.
+    """
+    facts = dict(gcp.facts)
+    x, y, together = (facts.get(name) for name in COVARIANCE)
+    if x is None or y is None:
+        return np.full((2, 2), np.nan)
+    together = together or 0.0
+    if not (x > 0 and y > 0 and abs(together) < 1):
+        raise GcpFormatError(
+            f"{file}: point {gcp.id} has standard errors {x:g} and {y:g}, correlation {together:g}",
+            f"Give {SIGMA_X} and {SIGMA_Y} above 0, or leave them empty.",
+        )
+    both = together * x * y
+    return np.array([[x * x, both], [both, y * y]])
+
+
+def read_facts(fields: Mapping[str, Any], where: str) -> tuple[Facts, bool]:
+    """Facts among the fields of a point, and whether it is enabled.
+
+    Without a field ``enable`` those are whose ``status`` is 0 (kept).
+
+    Raises
+    ------
+    GcpFormatError
+        One is no number.
+    """
+    found = {name: _number(fields[name], where) for name in NAMES if name in fields}
+    enable = _number(fields.get(ENABLE), where)
+    enabled = not found.get(STATUS) if enable is None else enable != 0
+    return tuple(found.items()), enabled
+
+
+def fields_of(gcp: Gcp) -> dict[str, float | None]:
+    """Enabled flag and facts to write; none of a point of which nothing more is known."""
+    return {ENABLE: int(gcp.enabled), **dict(gcp.facts)} if gcp.facts else {}
+
+
+def _number(value: Any, where: str) -> float | None:
+    if value is None or value == "":
+        return None
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise GcpFormatError(f"{where}: {value!r} is no number") from error
+    return number if math.isfinite(number) else None

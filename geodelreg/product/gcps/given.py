@@ -1,0 +1,61 @@
+"""Points out of a file, as a fit takes them: in pixels of the raster that they were made for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from geodelreg.errors import PointsError
+from geodelreg.geo.affine import affine_matrix, apply_affine
+from geodelreg.product.gcps.context import GcpContext, ground_of, pixels_of
+from geodelreg.product.gcps.facts import STATUS, covariance_of
+from geodelreg.values.points import GivenPoints, Status
+from geodelreg.values.raster import Grid
+
+
+def given_points(
+    path: Path,
+    format: str | None,  # noqa: A002 - the field's word
+    source: Grid,
+    reference: Grid | None,
+) -> GivenPoints:
+    """Read control points, also those that are not enabled.
+
+    Parameters
+    ----------
+    path : Path
+    format : str, optional
+        Key of `geodelreg.product.gcps.GCP_FORMATS`.
+    source : Grid
+        Of MS, with its original header.
+    reference : Grid, optional
+        Of PAN.
+
+    Raises
+    ------
+    GcpFormatError, PointsError, CrsTransformError
+    """
+    from geodelreg.product.gcps import in_crs_of, read_gcps
+
+    context = GcpContext(source, reference=reference)
+    gcps = in_crs_of(source, *read_gcps(path, format, context, every=True))
+    if not gcps:
+        raise PointsError(f"{path} has no points", "Name the file that `export_gcps` has written.")
+    unit = np.linalg.inv(affine_matrix(source.transform)[:, :2])
+    covariance = np.stack([covariance_of(gcp, str(path)) for gcp in gcps])
+    facts = [dict(gcp.facts) for gcp in gcps]
+    score = np.array([fact.get("correlation") for fact in facts], dtype=np.float64)
+    enabled = np.array([gcp.enabled for gcp in gcps])
+    rejected = [int(fact.get(STATUS) or 0) for fact in facts]
+    status = [code if code in set(Status) and code else int(Status.EXCLUDED) for code in rejected]
+    return GivenPoints(
+        str(path),
+        tuple(gcp.id for gcp in gcps),
+        pixels_of(gcps),
+        apply_affine(~source.transform, ground_of(gcps)),
+        np.asarray(np.einsum("ij,njk,lk->nil", unit, covariance, unit)),
+        score,
+        enabled,
+        np.array(status, dtype=np.uint8),
+    )

@@ -1,0 +1,284 @@
+"""Control points that a person has edited: as exported, disabled, moved, drawn."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from click.testing import CliRunner, Result
+from numpy.typing import NDArray
+from rasterio.warp import transform
+
+import geodelreg
+from geodelreg.errors import AlignmentRefusedError, GcpFormatError, PointsError
+from geodelreg.product.report import report_schema
+from geodelreg_cli.main import cli
+
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_tiles"
+MS, PAN = str(SAMPLES / "ms.tif"), str(SAMPLES / "pan.tif")
+TRUTH = json.loads((SAMPLES / "truth.json").read_text("utf-8"))
+TRUE, ON_PAN = Affine(*TRUTH["ms_true"]), Affine(*TRUTH["pan"])
+Array = NDArray[np.float64]
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(cli, [str(arg) for arg in args])
+
+
+def code(done: Result) -> int:
+    """What the process would end with."""
+    return int(getattr(done.exception, "exit_code", done.exit_code))
+
+
+def header(path: Path) -> Affine:
+    with rasterio.open(path) as dataset:
+        return dataset.transform
+
+
+def apart_px(one: Affine, other: Affine) -> float:
+    """Largest distance of two geotransforms at the corners of MS, MS pixels."""
+    height, width = TRUTH["ms_shape"]
+    corners = [(0, 0), (width, 0), (0, height), (width, height)]
+    return max(float(np.hypot(*np.subtract(~other @ (one @ at), at))) for at in corners)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with MS as `align` corrects it, and its points in every format with a meaning here."""
+    folder = tmp_path_factory.mktemp("exported")
+    for kept, names in (("kept", ("p.csv", "p.points", "p.txt")), ("all", ("all.geojson",))):
+        files = [arg for name in names for arg in ("--gcps", folder / name)]
+        out = ("-o", folder / f"{kept}.tif", "--points", kept, "-q")
+        done = run("align", MS, PAN, "--model", "affine", *out, *files)
+        assert done.exit_code == 0, done.output
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "within_px"), [("all.geojson", 1e-6), ("p.csv", 1e-6), ("p.points", 5e-3)]
+)
+@pytest.mark.parametrize("pan", [(PAN,), ()], ids=["with PAN", "without"])
+def test_unedited_points_give_the_correction_again(
+    exported: Path, tmp_path: Path, name: str, within_px: float, pan: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out.tif"
+    done = run("refit", exported / name, MS, *pan, "--model", "affine", "-o", out)
+    assert done.exit_code == 0, done.output
+    assert apart_px(header(out), header(exported / "kept.tif")) < within_px
+    assert ("PAN px" in done.stderr) == bool(pan)
+    with rasterio.open(out) as written, rasterio.open(MS) as ms:
+        assert np.array_equal(written.read(), ms.read())
+        assert written.tags()["GEODELREG_POINTS"] == name
+        assert written.tags().get("GEODELREG_PAN") == ("pan.tif" if pan else None)
+
+
+def test_the_report_says_what_was_done_and_applies(exported: Path, tmp_path: Path) -> None:
+    out, report, again = (tmp_path / name for name in ("out.tif", "r.json", "again.tif"))
+    done = run("refit", exported / "all.geojson", MS, PAN, "-o", out, "--report", report, "-q")
+    assert done.exit_code == 0, done.output
+    said = json.loads(report.read_text("utf-8"))
+    jsonschema.validate(said, report_schema())
+    assert said["search"] == "points"
+    assert said["inputs"]["points"]["files"][0]["path"].endswith("all.geojson")
+    assert said["tie_points"]["by_status"]["kept"] == said["accuracy"]["kept"] > 90
+    assert said["tie_points"]["total"] > said["accuracy"]["kept"]
+    assert said["accuracy"]["ncc_after"] is None
+    assert run("apply", report, MS, "-o", again, "-q").exit_code == 0
+    assert apart_px(header(again), header(out)) < 1e-9
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> Path:
+    with path.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def rows_at(
+    pixels: list[tuple[float, float]], place: Callable[[float, float], tuple[float, float]]
+) -> list[dict[str, Any]]:
+    """Points as one would type them, without standard errors."""
+    places = [place(*pixel) for pixel in pixels]
+    return [
+        {"id": f"p{n}", "column": c, "line": r, "x": x, "y": y, "enable": 1}
+        for n, ((c, r), (x, y)) in enumerate(zip(pixels, places, strict=True))
+    ]
+
+
+def truly(column: float, row: float) -> tuple[float, float]:
+    return TRUE @ (column, row)
+
+
+SPREAD = [(float(c), float(r)) for c in (10, 60, 110, 150) for r in (12, 70, 130)]
+
+
+def test_typed_points_give_what_they_lie_on_and_disabled_ones_do_not_count(
+    tmp_path: Path,
+) -> None:
+    rows = rows_at(SPREAD, truly)
+    rows[3] |= {"x": rows[3]["x"] + 500, "enable": 0}
+    found = geodelreg.refit(write_csv(tmp_path / "t.csv", rows), MS, model="affine")
+    assert apart_px(found.correction.corrected, TRUE) < 1e-6
+    assert found.accuracy.kept == len(SPREAD) - 1
+    assert found.accuracy.check_rmse_px < 1e-6
+    assert any("all count the same" in note for note in found.warnings)
+
+
+def test_few_points_have_no_accuracy_and_that_is_said(tmp_path: Path) -> None:
+    points = write_csv(tmp_path / "few.csv", rows_at([SPREAD[0], SPREAD[2], SPREAD[9]], truly))
+    done = run("refit", points, MS, "--model", "shift", "--dry-run")
+    assert done.exit_code == 0, done.output
+    found = geodelreg.refit(points, MS, model="shift")
+    if not np.isfinite(found.accuracy.check_rmse_px):
+        assert "too few to measure the accuracy" in done.stderr
+    assert found.accuracy.checked <= found.accuracy.kept == 3
+
+
+def drag(path: Path, target: Path, east_m: float, chosen: int, **fields: Any) -> str:
+    """Move the geometry of one kept feature as QGIS does; its identifier."""
+    document = json.loads(path.read_text("utf-8"))
+    kept = [f for f in document["features"] if f["properties"]["enable"]]
+    feature = kept[chosen]
+    properties = feature["properties"]
+    (lon,), (lat,) = transform(
+        "EPSG:32618", "EPSG:4326", [properties["x"] + east_m], [properties["y"]]
+    )
+    feature["geometry"]["coordinates"] = [round(lon, 9), round(lat, 9)]
+    properties |= fields
+    target.write_text(json.dumps(document), "utf-8")
+    return str(properties["id"])
+
+
+def error_px(alignment: geodelreg.Alignment, distance_to: str) -> float:
+    """PAN pixels between where a point says its MS pixel lies and where it truly does."""
+    index = int(distance_to)
+    points = alignment.tie_points
+    true = ~ON_PAN @ (TRUE @ tuple(points.source_px[index]))
+    return float(np.hypot(*np.subtract(points.reference_px[index], true)))
+
+
+def index_of(path: Path, name: str) -> str:
+    features = json.loads(path.read_text("utf-8"))["features"]
+    return str([feature["properties"]["id"] for feature in features].index(name))
+
+
+def test_a_dragged_point_counts_little_and_is_measured_when_asked(
+    exported: Path, tmp_path: Path
+) -> None:
+    edited = tmp_path / "edited.geojson"
+    name = drag(exported / "all.geojson", edited, 30.0, 40)
+    at = index_of(edited, name)
+    plain = geodelreg.refit(edited, MS, PAN, model="affine")
+    assert error_px(plain, at) == pytest.approx(3.0, abs=0.3)
+    assert apart_px(plain.correction.corrected, TRUE) < 0.02
+    assert any(f"placed by hand ({name})" in note for note in plain.warnings)
+    snapped = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
+    assert error_px(snapped, at) < 0.2
+    assert snapped.tie_points.sigma_px[int(at)].max() < 0.2
+    assert any(note.startswith("1 of 1 points placed by hand") for note in snapped.warnings)
+
+
+def test_a_drawn_point_is_looked_for_where_the_others_say(exported: Path, tmp_path: Path) -> None:
+    edited = tmp_path / "drawn.geojson"
+    name = drag(exported / "all.geojson", edited, 0.0, 30, row=None, col=None, x=None, y=None)
+    with pytest.raises(PointsError, match=f"point {name} lacks the pixel of MS") as caught:
+        geodelreg.refit(edited, MS, PAN)
+    assert "`snap=True`" in caught.value.remedy
+    done = run("refit", edited, MS, "--dry-run", "--snap")
+    assert done.exit_code == 2
+    assert "name PAN" in done.output
+    found = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
+    assert found.tie_points.kept[int(index_of(edited, name))]
+    assert error_px(found, index_of(edited, name)) < 0.2
+
+
+def test_a_field_follows_points_that_bend(tmp_path: Path) -> None:
+    def bent(column: float, row: float) -> tuple[float, float]:
+        return TRUE @ (column + np.sin(row / 40), row + 0.8 * np.cos(column / 40))
+
+    pixels = [(c + 4.0, r + 4.0) for c in range(0, 150, 12) for r in range(0, 150, 12)]
+    points, out = write_csv(tmp_path / "bent.csv", rows_at(pixels, bent)), tmp_path / "out.tif"
+    found = geodelreg.refit(points, MS, model="field", max_shift_px=100)
+    steps = range(22, 130, 12)
+    between = np.array([(float(c), float(r)) for c in steps for r in steps])
+    target = found.solution.map.forward(between)
+    placed = np.array([found.source.grid.transform @ tuple(at) for at in target])
+    goal = np.array([bent(*at) for at in between])
+    assert np.abs(placed - goal).max() < 0.05 * 40
+    refused = run("refit", points, MS, "--model", "field", "-o", out)
+    assert (code(refused), out.exists()) == (2, False)
+    assert run("refit", points, MS, "--model", "field", "-o", out, "--warp", "-q").exit_code == 0
+
+
+BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] = {
+    "on a line": (
+        lambda: rows_at([(float(i), 2.0 * i) for i in range(5, 60, 5)], truly), (), "on a line"
+    ),
+    "too few": (
+        lambda: rows_at(SPREAD[:3], truly), ("--model", "affine"), "3 enabled points determine no"
+    ),
+    "few for a field": (
+        lambda: rows_at(SPREAD[:5], truly), ("--model", "field", "--warp"), "needs 12"
+    ),
+    "one place twice": (
+        lambda: rows_at([*SPREAD, SPREAD[4]], truly), (), "points p4 and p12 are at one place"
+    ),
+    "of a larger raster": (
+        lambda: rows_at([(c + 900, r) for c, r in SPREAD], truly), (), "those of another raster"
+    ),
+    "of another place": (
+        lambda: rows_at(SPREAD, lambda c, r: (5e5 + 40 * c, 6e6 - 40 * r)), (), "another raster"
+    ),
+    "mirrored": (
+        lambda: rows_at(SPREAD, lambda c, r: truly(150 - c, r)), (), "folds or mirrors"
+    ),
+    "none enabled": (
+        lambda: [row | {"enable": 0} for row in rows_at(SPREAD, truly)], (), "no enabled point"
+    ),
+    "words for numbers": (
+        lambda: [row | {"enable": "yes"} for row in rows_at(SPREAD, truly)], (), "'yes' is no"
+    ),
+    "an error below 0": (
+        lambda: [row | {"sigma_x": -1, "sigma_y": 1} for row in rows_at(SPREAD, truly)], (),
+        "standard errors -1",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_points_are_refused_with_cause_and_remedy(tmp_path: Path, name: str) -> None:
+    make, more, cause = BAD[name]
+    points, out = write_csv(tmp_path / "bad.csv", make()), tmp_path / "out.tif"
+    done = run("refit", points, MS, "-o", out, "--report", tmp_path / "r.json", *more)
+    assert isinstance(done.exception, PointsError | GcpFormatError)
+    assert str(points) in done.exception.cause
+    assert cause in done.exception.cause
+    assert done.exception.remedy
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
+
+
+def test_limits_refuse_and_what_needs_pan_is_refused_before_the_work(
+    exported: Path, tmp_path: Path
+) -> None:
+    points, out = exported / "p.csv", tmp_path / "out.tif"
+    refused = run("refit", points, MS, PAN, "-o", out, "--max-shift", 2)
+    assert isinstance(refused.exception, AlignmentRefusedError)
+    for more, word in (
+        (("--report", tmp_path / "r.html"), "pages show MS on PAN"),
+        (("--warp", "--grid", "pan"), "needs PAN"),
+    ):
+        done = run("refit", points, MS, "-o", out, *more)
+        assert code(done) == 2
+        assert word in done.output + str(done.exception)
+    assert not list(tmp_path.iterdir())
+    same = run("refit", points, MS, PAN, "--dry-run", "--gcps", points, "--overwrite")
+    assert code(same) == 2
