@@ -214,8 +214,8 @@ def export_gcps(
         One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
     overwrite : bool
     points : str
-        ``kept``, or ``all`` with the rejected ones: as points that QGIS does not enable, or GeoJSON
-        with status (0 = kept), residual, standard error and correlation as numbers.
+        ``kept``, or ``all`` with the rejected ones, as points that are not enabled: QGIS, GeoJSON,
+        GeoPackage, FlatGeobuf.
 
     Raises
     ------

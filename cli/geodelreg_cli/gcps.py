@@ -32,7 +32,8 @@ Examples:
     geodelreg gcps ms.geojson ms.pts --raster ms.tif --reference pan.tif
 
 Formats: qgis (.points), gdal (.gcp, .txt: gdal_translate --optfile), csv (.csv: gdal raster edit),
-geojson (.geojson, .json), vrt (.vrt), envi (.pts, image to image), envi-map (image to map).
+geojson (.geojson, .json), gpkg (.gpkg), flatgeobuf (.fgb), vrt (.vrt), envi (.pts, image to image),
+envi-map (image to map).
 """
 
 

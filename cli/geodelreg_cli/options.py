@@ -56,7 +56,9 @@ class NumberOr(click.ParamType):  # type: ignore[type-arg]  # generic from click
 WORDS = {"band": NumberOr("auto", None), "threads": NumberOr("ALL_CPUS", 0)}
 
 
-GCP_FORMAT = click.Choice(("qgis", "gdal", "csv", "geojson", "vrt", "envi", "envi-map"))
+GCP_FORMAT = click.Choice(
+    ("qgis", "gdal", "csv", "geojson", "gpkg", "flatgeobuf", "vrt", "envi", "envi-map")
+)
 
 
 class SectionOption(click.Option):

@@ -87,8 +87,8 @@ def output_params() -> list[SectionOption]:
             metavar="FILE",
             section=OUTPUT,
             help="Write the tie points as ground control points; the format follows the extension: "
-            ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .vrt, "
-            ".pts ENVI; - writes to stdout. May be repeated.",
+            ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .gpkg, "
+            ".fgb, .vrt, .pts ENVI; - writes to stdout. May be repeated.",
         ),
         flag(
             "--gcp-format",
@@ -102,7 +102,8 @@ def output_params() -> list[SectionOption]:
             default="kept",
             show_default=True,
             section=OUTPUT,
-            help="Tie points in --gcps; all has the rejected ones, too (QGIS, GeoJSON).",
+            help="Tie points in --gcps; all has the rejected ones, too (QGIS, "
+            "GeoJSON, GeoPackage, FlatGeobuf).",
         ),
         flag(
             "--report",

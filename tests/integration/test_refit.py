@@ -54,7 +54,10 @@ def apart_px(one: Affine, other: Affine) -> float:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with MS as `align` corrects it, and its points in every format with a meaning here."""
     folder = tmp_path_factory.mktemp("exported")
-    for kept, names in (("kept", ("p.csv", "p.points", "p.txt")), ("all", ("all.geojson",))):
+    for kept, names in (
+        ("kept", ("p.csv", "p.points", "p.txt")),
+        ("all", ("all.geojson", "all.gpkg", "all.fgb")),
+    ):
         files = [arg for name in names for arg in ("--gcps", folder / name)]
         out = ("-o", folder / f"{kept}.tif", "--points", kept, "-q")
         done = run("align", MS, PAN, "--model", "affine", *out, *files)
@@ -63,7 +66,14 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "within_px"), [("all.geojson", 1e-6), ("p.csv", 1e-6), ("p.points", 5e-3)]
+    ("name", "within_px"),
+    [
+        ("all.geojson", 1e-6),
+        ("all.gpkg", 1e-6),
+        ("all.fgb", 1e-6),
+        ("p.csv", 1e-6),
+        ("p.points", 5e-3),
+    ],
 )
 @pytest.mark.parametrize("pan", [(PAN,), ()], ids=["with PAN", "without"])
 def test_unedited_points_give_the_correction_again(
@@ -199,6 +209,55 @@ def test_a_drawn_point_is_looked_for_where_the_others_say(exported: Path, tmp_pa
     found = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
     assert found.tie_points.kept[int(index_of(edited, name))]
     assert error_px(found, index_of(edited, name)) < 0.2
+
+
+@pytest.mark.parametrize("name", ["all.gpkg", "all.fgb"])
+def test_layers_hold_numbers_and_may_be_edited_and_reprojected(
+    exported: Path, tmp_path: Path, name: str
+) -> None:
+    """By geopandas: one point disabled, one dragged by three PAN pixels, one drawn."""
+    import geopandas
+    from shapely import Point
+
+    table = geopandas.read_file(exported / name)
+    assert table.crs.to_epsg() == 32618
+    assert set(table["enable"]) == {0, 1}
+    assert np.array_equal(table["enable"] == 1, table["status"] == 0)
+    numbers = ["row", "col", "x", "sigma_x", "sigma_right_px", "correlation", "residual_down_px"]
+    assert (table[numbers].dtypes == np.float64).all()
+    first, second, third = table.index[table["enable"] == 1][[5, 50, 70]]
+    table.loc[first, "enable"] = 0
+    table.loc[second, "geometry"] = Point(table.loc[second, "x"] + 30, table.loc[second, "y"])
+    table.loc[third, [*numbers, "y", "sigma_y", "enable", "status"]] = None
+    edited = tmp_path / f"edited{Path(name).suffix}"
+    table.to_crs(4326).to_file(edited, layer="points")
+    found = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
+    kept = found.tie_points.kept
+    assert kept.sum() == (table["enable"] == 1).sum() + 1
+    errors = [error_px(found, str(index)) for index in np.flatnonzero(kept)]
+    assert max(errors) < 0.3
+    assert any(note.startswith("2 of 2 points placed by hand") for note in found.warnings)
+
+
+def test_layers_are_the_same_bytes_again(exported: Path, tmp_path: Path) -> None:
+    for name in ("all.gpkg", "all.fgb"):
+        args = ("--dry-run", "--points", "all", "--model", "affine", "-q")
+        assert run("align", MS, PAN, *args, "--gcps", tmp_path / name).exit_code == 0
+        assert (tmp_path / name).read_bytes() == (exported / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["bad.gpkg", "bad.fgb"])
+def test_what_is_no_layer_of_points_is_refused(tmp_path: Path, name: str) -> None:
+    import geopandas
+    from shapely import box
+
+    (tmp_path / name).write_bytes(b"nothing of use")
+    with pytest.raises(GcpFormatError, match="does not begin as"):
+        geodelreg.refit(tmp_path / name, MS)
+    squares = geopandas.GeoDataFrame({"id": ["1"]}, geometry=[box(0, 0, 1, 1)], crs=32618)
+    squares.to_file(tmp_path / f"squares_{name}")
+    with pytest.raises(GcpFormatError, match="a feature is no point"):
+        geodelreg.refit(tmp_path / f"squares_{name}", MS)
 
 
 def test_a_field_follows_points_that_bend(tmp_path: Path) -> None:

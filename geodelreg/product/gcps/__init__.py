@@ -16,8 +16,9 @@ import numpy as np
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.geotiff.atomic import write_text_atomically
-from geodelreg.product.gcps import envi, geojson, optfile, qgis, table, vrt
+from geodelreg.geotiff.atomic import write_bytes_atomically
+from geodelreg.geotiff.targets import STDOUT
+from geodelreg.product.gcps import envi, geojson, optfile, qgis, table, vector, vrt
 from geodelreg.product.gcps.context import (
     Decoded,
     Decoder,
@@ -49,12 +50,16 @@ _LARGEST_BYTES = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class GcpFormat:
-    """One file format: its extensions (the first format that names one is its default)."""
+    """One file format: its extensions (the first format that names one is its default).
+
+    What is no text is read by its path.
+    """
 
     extensions: tuple[str, ...]
     description: str
     encode: Encoder
     decode: Decoder
+    is_text: bool = True
 
 
 GCP_FORMATS = {
@@ -63,6 +68,12 @@ GCP_FORMATS = {
     "csv": GcpFormat((".csv",), "gdal raster edit --gcp @FILE", table.encode, table.decode),
     "geojson": GcpFormat(
         (".geojson", ".json"), "GeoJSON, as rio gcps", geojson.encode, geojson.decode
+    ),
+    "gpkg": GcpFormat(
+        (".gpkg",), "GeoPackage", vector.encode_geopackage, vector.decode, is_text=False
+    ),
+    "flatgeobuf": GcpFormat(
+        (".fgb",), "FlatGeobuf", vector.encode_flatgeobuf, vector.decode, is_text=False
     ),
     "vrt": GcpFormat((".vrt",), "VRT of the source raster with GCPs", vrt.encode, vrt.decode),
     "envi": GcpFormat(
@@ -74,7 +85,7 @@ GCP_FORMATS = {
 }
 
 
-_WITH_REJECTED = ("qgis", "geojson")
+_WITH_REJECTED = ("qgis", "geojson", "gpkg", "flatgeobuf")
 
 
 def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp, ...]:
@@ -172,7 +183,8 @@ def write_gcps(
     if name not in _WITH_REJECTED and not all(gcp.enabled for gcp in gcps):
         raise GcpFormatError(
             f"{target}: the format {name} cannot say which points were rejected",
-            "Use QGIS points or GeoJSON, or leave the rejected ones out (`points='kept'`).",
+            "Use QGIS points, GeoJSON, GeoPackage or FlatGeobuf, or leave the rejected ones out "
+            "(`points='kept'`).",
         )
     for gcp in gcps:
         if not all(map(math.isfinite, (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z))):
@@ -180,7 +192,11 @@ def write_gcps(
                 f"{target}: point {gcp.id} has a coordinate that is not finite",
                 "Leave the point out.",
             )
-    write_text_atomically(target, chosen.encode(gcps, context, target), overwrite)
+    if not chosen.is_text and target == STDOUT:
+        raise GcpFormatError(f"{name} cannot be written to standard output", "Name a file.")
+    content = chosen.encode(gcps, context, target)
+    data = content.encode() if isinstance(content, str) else content
+    write_bytes_atomically(target, data, overwrite)
 
 
 def read_gcps(
@@ -216,11 +232,12 @@ def read_gcps(
     """
     source = Path(path)
     name = format or _format_by_extension(source)
-    text = _text(source)
-    if format is None and name == "envi" and envi.is_image_to_map(text):
-        name = "envi-map"
+    chosen = _format(name)
+    content = _content(source, chosen.is_text)
+    if format is None and name == "envi" and envi.is_image_to_map(str(content)):
+        chosen = _format(name := "envi-map")
     try:
-        gcps, crs_wkt = _format(name).decode(text, context)
+        gcps, crs_wkt = chosen.decode(content, context)
         if not every:
             gcps = tuple(gcp for gcp in gcps if gcp.enabled)
             _check_pixels(gcps)
@@ -259,8 +276,8 @@ def _check_pixels(gcps: Sequence[Gcp]) -> None:
         )
 
 
-def _text(source: Path) -> str:
-    """Content of a file of bearable size."""
+def _content(source: Path, is_text: bool) -> str | Path:
+    """Text of a file of bearable size; of what is no text the path."""
     try:
         with source.open("rb") as file:
             data = file.read(_LARGEST_BYTES + 1)
@@ -270,6 +287,8 @@ def _text(source: Path) -> str:
                 f"{_LARGEST_BYTES // 1_000_000} MB",
                 "Check that it is the right file, or split it into several.",
             )
+        if not is_text:
+            return source
         return io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig").read()
     except (OSError, UnicodeDecodeError) as error:
         raise GcpFormatError(

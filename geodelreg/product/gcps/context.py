@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -58,8 +59,9 @@ class GcpContext:
 
 
 Decoded = tuple[tuple[Gcp, ...], str | None]
-Encoder = Callable[[Sequence[Gcp], GcpContext, Path], str]
-Decoder = Callable[[str, GcpContext | None], Decoded]
+Encoder = Callable[[Sequence[Gcp], GcpContext, Path], str | bytes]
+Decoder = Callable[[Any, GcpContext | None], Decoded]
+"""Of the text of a file, or its path where it is none."""
 
 
 def reading_order(tie_points: TiePoints, every: bool = False) -> IntArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,10 @@ from geodelreg.product.gcps.context import (
     Decoded,
     GcpContext,
     crs_name,
-    crs_wkt_of,
     ground_of,
 )
-from geodelreg.product.gcps.features import Feature, fields_of_gcp, gcps_of
+from geodelreg.product.gcps.features import fields_of_gcp, gcps_of
 from geodelreg.values.points import Gcp
-from geodelreg.values.raster import FloatArray
 
 _RECORD_SEPARATOR = "\x1e"
 _MOVED_DEG = 1e-7
@@ -76,34 +74,8 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     """
     features = _features(text)
     properties = [_properties(feature) for feature in features]
-    names = {str(item["crs"]) for item in properties if item.get("crs")}
-    if len(names) > 1:
-        raise GcpFormatError("the features have different CRSs")
-    crs_wkt = crs_wkt_of(names.pop()) if names else None
-    around = crs_wkt or (context.source.crs_wkt if context else _wgs84())
     places = np.array([_position(feature) for feature in features]).reshape(-1, 2)
-    return gcps_of(list(_placed(properties, places, around))), crs_wkt
-
-
-def _placed(
-    properties: Sequence[Mapping[str, Any]], places: FloatArray, crs_wkt: str
-) -> Iterator[Feature]:
-    """Features with their geometries in the CRS of their coordinates."""
-    inside = map_points(places, _wgs84(), crs_wkt)
-    said = np.array([[_coordinate(item, axis) for axis in "xy"] for item in properties])
-    claimed = map_points(said.reshape(-1, 2), crs_wkt, _wgs84())
-    for item, (x, y), apart in zip(
-        properties, inside.tolist(), np.abs(places - claimed).max(axis=1).tolist(), strict=True
-    ):
-        known = math.isfinite(x) and math.isfinite(y)
-        yield Feature(item, (x, y) if known else None, known and apart > _MOVED_DEG)
-
-
-def _coordinate(item: Mapping[str, Any], axis: str) -> float:
-    try:
-        return float(item[axis])
-    except (KeyError, TypeError, ValueError):
-        return math.nan
+    return gcps_of(properties, places, _wgs84(), _MOVED_DEG, context)
 
 
 def _position(feature: Any) -> tuple[float, float]:
