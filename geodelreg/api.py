@@ -203,6 +203,7 @@ def refit(
         The PAN raster.  Without it, what is called PAN pixels are pixels of MS.
     options : AlignOptions, optional
         Those that tell of a search or of its gate have no meaning here.  ``auto`` takes no field.
+        `band` takes the points of one band, where a file has those of each.
     format : str, optional
         One of ``geodelreg.product.gcps.GCP_FORMATS``; by the extension when not given.
     snap : bool
@@ -238,7 +239,8 @@ def refit(
     file = Path(points)
     with _open(source, reference, options, masks, pan_masks) as rasters:
         pan = None if reference is None else rasters.pan
-        given = given_points(file, format, rasters.ms.grid, None if pan is None else pan.grid)
+        pan_grid = None if pan is None else pan.grid
+        given = given_points(file, format, rasters.ms.grid, pan_grid, options.band)
         pair, solution = refit_pair(
             rasters.ms, pan, given, options, snap, progress, rasters.timings
         )

@@ -7,7 +7,8 @@ from pathlib import Path
 from geodelreg.door.names import as_path
 from geodelreg.door.opening import allowing
 from geodelreg.errors import UsageError
-from geodelreg.options import WriteOptions, check_header_holds
+from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.options import WriteOptions, check_header_holds, one_header
 from geodelreg.product.stored import StoredCorrection, read_correction
 from geodelreg.raster.reader import open_raster
 from geodelreg.writing import AnyPath, input_paths
@@ -34,7 +35,8 @@ def apply(
     source : path
         A raster in any CRS and of any pixel size; or a vector file: GeoJSON, GeoPackage, CSV.
     target : path, optional
-        The output; without it the header of the raster itself is corrected.
+        The output; without it the header of the raster itself is corrected.  Of a correction with
+        ``per_band`` a folder, for one file per band, a VRT, or a raster with `warp`.
     options : WriteOptions, optional
         Its `warp` resamples, which a field needs.
     force : bool
@@ -65,6 +67,11 @@ def apply(
     stored = read_correction(as_path(str(correction)))
     file = as_path(str(source))
     if file.suffix.lower() in VECTORS:
+        if stored.bands:
+            raise UsageError(
+                f"{stored.path} tells where each band lies, and {file} has no bands",
+                "Make a report without `per_band` for it.",
+            )
         if target is None:
             raise UsageError(f"{file} is a vector file, which has no header", "Name an output.")
         with together(inputs=lambda: [file, stored.path]):
@@ -88,18 +95,27 @@ def _apply_to_raster(
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
     from geodelreg.product.warp import write_warped
+    from geodelreg.writing_bands import write_apart
 
     with open_raster(file, allow=allow) as reader:
-        grid = reader.grid
+        grid, count = reader.grid, len(reader.band_names)
     if not force:
         stored.check_fits(str(file), grid)
     correction, placement = stored.of_raster(grid)
-    if placement is not None and not options.warp:
+    apart = stored.of_bands(str(file), grid, count)
+    bent = placement is not None or any(held is not None for _, held in apart.values())
+    if bent and not options.warp:
         check_header_holds(stored.model)
         raise UsageError(
             f"{file} is in another CRS, in which the correction is no affine",
             "Resample (`warp=True`).",
         )
+    if apart and not options.warp:
+        if target is None:
+            raise one_header()
+        bands = {number: own for number, (own, _) in apart.items()}
+        with together(inputs=lambda: [*input_paths([str(file)], allow), stored.path]):
+            return write_apart([(file, correction, bands)], Path(target), stored.tags, options)
     if target is None:
         with together([file]):
             return edit_in_place(file, correction, (), stored.tags)
@@ -108,6 +124,11 @@ def _apply_to_raster(
         check_replaceable(out, options.overwrite, stale_beside(out, file))
         if not options.warp:
             return write_corrected(file, out, correction, (), stored.tags, options)
+        moved = {
+            number: held or AffineMap(~grid.transform @ own.corrected)
+            for number, (own, held) in apart.items()
+        }
         return write_warped(
-            file, out, correction, stored.reference, stored.tags, options, placement=placement
-        )
+            file, out, correction, stored.reference, stored.tags, options,
+            placement=placement, bands=moved,
+        )  # fmt: skip

@@ -224,13 +224,21 @@ def export_gcps(
     OutputExistsError, OutputIsInputError, OutputUnwritableError
     """
     from geodelreg.geotiff.atomic import together
-    from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
+    from geodelreg.product.gcps import (
+        WITH_FIELDS,
+        format_of,
+        gcp_context,
+        gcps_from_alignment,
+        write_gcps,
+    )
 
     check_accepted(alignment)
     if points not in ("kept", "all"):
         raise UsageError(f"`points={points!r}` is unknown", "Use one of: kept, all.")
     every = points == "all"
-    gcps, context = gcps_from_alignment(alignment, every), gcp_context(alignment, every)
+    by_band = format_of(Path(path), format) in WITH_FIELDS
+    gcps = gcps_from_alignment(alignment, every, bands=by_band)
+    context = gcp_context(alignment, every)
     with together(inputs=lambda: inputs_of(alignment)):
         write_gcps(Path(path), gcps, format, context=context, overwrite=overwrite)
 

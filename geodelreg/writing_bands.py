@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,38 +51,70 @@ def write_bands(alignment: Alignment, target: Path, options: WriteOptions) -> li
     UsageError, OutputExistsError, OutputIsInputError, OutputUnwritableError
     """
     from geodelreg.geotiff.atomic import together
-    from geodelreg.geotiff.sidecars import stale_beside
-    from geodelreg.geotiff.targets import check_replaceable, make_folder
-    from geodelreg.product.band_files import band_targets, write_band, write_vrt
     from geodelreg.writing import correction_of_file, inputs_of
 
     if options.georef == "gcps":
         raise UsageError("`georef='gcps'` has one place for all bands", "Drop it, or `per_band`.")
     check_header_holds(alignment.solution.model)
-    paths = [as_path(path) for path in alignment.source.paths]
-    corrections = {path: correction_of_file(alignment, path)[0] for path in paths}
-    by_file = bands_by_file(alignment)
-    if bands_target(target, len(paths)):
-        with together([target], lambda: inputs_of(alignment)):
+    by_file, files = bands_by_file(alignment), []
+    for path in map(as_path, alignment.source.paths):
+        correction = correction_of_file(alignment, path)[0]
+        bands = _geotransforms(alignment, by_file.get(path, {}), correction)
+        files.append((path, correction, bands))
+    with together(inputs=lambda: inputs_of(alignment)):
+        return write_apart(files, target, provenance_tags(alignment), options)
+
+
+def write_apart(
+    files: Sequence[tuple[Path, Correction, Mapping[int, Correction]]],
+    target: Path,
+    tags: Mapping[str, str],
+    options: WriteOptions,
+) -> list[str]:
+    """Write bands with headers of their own.
+
+    Parameters
+    ----------
+    files : sequence of (Path, Correction, mapping of int to Correction)
+        Rasters, each with its correction and those of bands, from 1, that lie elsewhere.
+    target : Path
+        Folder, made when missing, or a VRT of one file.
+    tags : mapping of str to str
+        Provenance.
+    options : WriteOptions
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    UsageError, OutputExistsError, OutputIsInputError, OutputUnwritableError
+    """
+    from geodelreg.geotiff.atomic import together
+    from geodelreg.geotiff.sidecars import stale_beside
+    from geodelreg.geotiff.targets import check_replaceable, make_folder
+    from geodelreg.product.band_files import band_targets, write_band, write_vrt
+
+    if bands_target(target, len(files)):
+        ((path, correction, bands),) = files
+        with together([target]):
             check_replaceable(target, options.overwrite)
-            placed = _geotransforms(alignment, by_file.get(paths[0], {}), corrections[paths[0]])
-            bands = {number: one.corrected for number, one in placed.items()}
-            write_vrt(paths[0], target, corrections[paths[0]].corrected, bands, options)
+            placed = {number: one.corrected for number, one in bands.items()}
+            write_vrt(path, target, correction.corrected, placed, options)
         return []
     make_folder(target)
     outputs = [
-        (path, number, out) for path in paths for number, out in band_targets(path, target).items()
+        (path, number, out, bands.get(number, correction))
+        for path, correction, bands in files
+        for number, out in band_targets(path, target).items()
     ]
-    tags, notes = provenance_tags(alignment), []
-    with together([out for _, _, out in outputs], lambda: inputs_of(alignment)):
-        for path, _, out in outputs:
+    notes: list[str] = []
+    with together([out for _, _, out, _ in outputs]):
+        for path, _, out, _ in outputs:
             check_replaceable(out, options.overwrite, stale_beside(out, path))
-        own = {
-            path: _geotransforms(alignment, by_file.get(path, {}), corrections[path])
-            for path in paths
-        }
-        for path, number, out in outputs:
-            correction = own[path].get(number, corrections[path])
+        for path, number, out, correction in outputs:
             notes += write_band(path, number, out, correction, tags, options)
     return notes
 

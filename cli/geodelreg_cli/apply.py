@@ -72,7 +72,8 @@ def apply(
 
     Rasters of any pixel size and CRS get a corrected header and keep their pixels, or are resampled
     (--warp). GeoJSON, GeoPackage and CSV files (columns lon,lat, or x,y in the CRS of MS) get
-    corrected coordinates. Of several files all are written or none.
+    corrected coordinates. Of several files all are written or none. After align --per-band, each
+    band of a raster is put where it lies: OUT is a folder, a .vrt, or resampled (--warp).
     """
     configure_logging(verbose, quiet, debug)
     keep_to(given["allow"])
@@ -83,14 +84,16 @@ def apply(
         raise click.UsageError("--in-place corrects the header and nothing else.")
     import geodelreg
     from geodelreg.geotiff.atomic import together
+    from geodelreg.product.stored import read_correction
     from geodelreg_cli.outputs import raster_targets
 
-    targets = [] if output is None else raster_targets([str(file) for file in files], output)
-    if len(files) > 1 and output is not None:
+    apart = not options.warp and bool(read_correction(correction).bands)
+    targets = [] if output is None else raster_targets(list(map(str, files)), output, apart)
+    if output is not None and any(target.parent == output for target in targets):
         output.mkdir(parents=True, exist_ok=True)
     with together(files if in_place else targets, lambda: [correction, *files]):
         for number, file in enumerate(files):
-            target = targets[number] if targets else None
+            target = output if apart or output is None else targets[number]
             notes = geodelreg.apply(
                 correction, file, target, options, force=force, allow=given["allow"]
             )

@@ -26,6 +26,7 @@ from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import (
     Accuracy,
     Alignment,
+    BandMap,
     Input,
     Outcome,
     Reason,
@@ -88,11 +89,6 @@ def read_report(path: Path) -> Alignment:
 
 
 def _alignment(report: Mapping[str, Any]) -> Alignment:
-    if report["bands"]:
-        raise ReportError(
-            "the report tells where each band lies, and no one correction is right for all",
-            "Align the other file itself, or make a report without `per_band`.",
-        )
     source = _input(report["inputs"]["source"])
     verdict, warnings = report["verdict"], tuple(map(str, report["warnings"]))
     points = report["inputs"].get("points")
@@ -105,6 +101,7 @@ def _alignment(report: Mapping[str, Any]) -> Alignment:
         step_counts={str(step["step"]): int(step["points"]) for step in report["step_counts"]},
         band_weights={str(k): float(v) for k, v in report["band_weights"].items()},
         warnings=warnings,
+        bands=tuple(_band(band, source.grid) for band in report["bands"]),
     )
     return Alignment(
         source=source,
@@ -132,16 +129,32 @@ def _input(given: Mapping[str, Any]) -> Input:
 
 
 def _map(found: Mapping[str, Any], shape: tuple[int, int]) -> PixelMap:
-    if found["pixel_map"]["kind"] == "field":
-        return FieldMap.from_json(found["pixel_map"])
-    matrix = np.array(found["pixel_map"]["matrix"], dtype=np.float64)
     values = _floats(found["sigma_source_px"])
-    sigma = OnLattice(values, shape) if values.any() else None
-    if found["pixel_map"]["kind"] == "affine":
+    return _pixel_map(found["pixel_map"], OnLattice(values, shape) if values.any() else None)
+
+
+def _pixel_map(said: Mapping[str, Any], sigma: OnLattice | None = None) -> PixelMap:
+    kind = said["kind"]
+    if kind == "field":
+        return FieldMap.from_json(said)
+    if kind == "composed":
+        first, second = map(_pixel_map, said["maps"])
+        return first.then(second)
+    matrix = np.array(said["matrix"], dtype=np.float64)
+    if kind == "affine":
         return AffineMap(affine_from_matrix(matrix), sigma)
-    if found["pixel_map"]["kind"] == "projective":
+    if kind == "projective":
         return ProjectiveMap(matrix, sigma)
-    raise ValueError(f"a map of the kind {found['pixel_map']['kind']!r}")
+    raise ValueError(f"a map of the kind {kind!r}")
+
+
+def _band(given: Mapping[str, Any], source: Grid) -> BandMap:
+    if given["pixel_map"] is None:
+        corrected = Affine.from_gdal(*map(float, given["corrected_geotransform"]))
+        placed: PixelMap = AffineMap(~source.transform @ corrected)
+    else:
+        placed = _pixel_map(given["pixel_map"])
+    return BandMap(int(given["number"]), str(given["name"]), placed, float(given["sigma_px"]))
 
 
 def _tie_points(points: list[Mapping[str, Any]] | None) -> TiePoints:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.product.reading import read_report
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
-from geodelreg.values.result import Correction
+from geodelreg.values.result import Correction, Outcome
 from geodelreg.version import __version__
 
 _AFFINE_ENOUGH_PX = 1e-3
@@ -28,6 +28,10 @@ _EDGE_PLACES = 16
 _LATTICE = 5
 _LEAST_SHARE = 0.5
 """Of a file, or of the raster that was aligned, that both must cover."""
+
+
+_Placed = tuple[Correction, PixelMap | None]
+"""Header, and map where that holds none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +49,8 @@ class StoredCorrection:
         MS pixels to MS header pixels.
     tags : dict of str to str
         Provenance, ``GEODELREG_*``.
+    bands : dict of int to PixelMap
+        Of MS bands, from 1, that lie elsewhere than `map` says.
     """
 
     path: Path
@@ -53,6 +59,7 @@ class StoredCorrection:
     model: str
     map: PixelMap
     tags: Mapping[str, str]
+    bands: Mapping[int, PixelMap] = field(default_factory=dict)
 
     def ground(self, xy: FloatArray, crs_wkt: str) -> FloatArray:
         """(..., 2) map coordinates, in any CRS, of a file with the same error, corrected."""
@@ -61,7 +68,7 @@ class StoredCorrection:
         there = apply_affine(self.source.transform, moved)
         return map_points(there, self.source.crs_wkt, crs_wkt)
 
-    def of_raster(self, grid: Grid) -> tuple[Correction, PixelMap | None]:
+    def of_raster(self, grid: Grid) -> _Placed:
         """Of a raster that shares the header error: its header, and its map where that holds none.
 
         Parameters
@@ -69,9 +76,36 @@ class StoredCorrection:
         grid : Grid
             With its own header, in any CRS.
         """
+        return self._placed(self.map, grid)
+
+    def of_bands(self, name: str, grid: Grid, count: int) -> dict[int, _Placed]:
+        """The same of each band of a raster that lies elsewhere than the others.
+
+        Parameters
+        ----------
+        name : str
+            Of the raster, for messages.
+        grid : Grid
+        count : int
+            Of its bands.
+
+        Raises
+        ------
+        CorrectionMisfitError
+            It has fewer bands than the correction tells of.
+        """
+        if count < max(self.bands, default=0):
+            raise CorrectionMisfitError(
+                f"{name} has {count} bands, and the correction {self.path} tells where each of "
+                f"{max(self.bands)} bands lies",
+                "Apply it to rasters with the bands of MS; for others align without `per_band`.",
+            )
+        return {number: self._placed(placed, grid) for number, placed in self.bands.items()}
+
+    def _placed(self, moved: PixelMap, grid: Grid) -> _Placed:
         there = header_map(grid, self.source)
-        placement = there.then(self.map).then(Inverse(there))
-        affine = self.map.as_affine()
+        placement = there.then(moved).then(Inverse(there))
+        affine = moved.as_affine()
         if affine is not None and there.as_affine() is not None:
             shared = self.source.transform @ affine @ ~self.source.transform
             corrected, held = shared @ grid.transform, True
@@ -154,4 +188,6 @@ def read_correction(path: Path) -> StoredCorrection:
         "GEODELREG_VERSION": __version__,
     }
     reference = alignment.reference.grid
-    return StoredCorrection(path, source, reference, correction.model, placement, tags)
+    aligned = alignment.verdict.outcome is Outcome.ALIGNED
+    bands = {band.number: band.map for band in alignment.solution.bands} if aligned else {}
+    return StoredCorrection(path, source, reference, correction.model, placement, tags, bands)

@@ -19,7 +19,7 @@ import geodelreg
 from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import HeaderError, Scene, SceneSpec, make_scene, write_scene
 from geodelreg import Alignment, AlignOptions, WriteOptions
-from geodelreg.errors import AlignmentRefusedError, ReportError, UsageError
+from geodelreg.errors import AlignmentRefusedError, CorrectionMisfitError, UsageError
 from geodelreg.product.report import report_dict, report_schema
 from geodelreg_cli.main import cli
 
@@ -100,14 +100,72 @@ def test_without_it_the_refusal_names_it(apart: Made) -> None:
     assert "per_band=True" in caught.value.remedy
 
 
-def test_the_report_tells_of_each_band_and_is_not_applied(apart: Made, tmp_path: Path) -> None:
+def test_the_report_tells_of_each_band(apart: Made) -> None:
     report = json.loads(json.dumps(report_dict(apart.alignment)))
     jsonschema.validate(report, report_schema())
     shifts = np.array([band["shift_px"] for band in report["bands"]])
     assert np.abs(shifts - shifts[0] - np.array(SHIFTS_PX) + SHIFTS_PX[0]).max() < 1.0
-    (tmp_path / "report.json").write_text(json.dumps(report), "utf-8")
-    with pytest.raises(ReportError, match="each band"):
-        geodelreg.apply(tmp_path / "report.json", apart.ms, tmp_path / "out.tif")
+
+
+@pytest.mark.parametrize("name", ["bands", "out.vrt", "out.tif"])
+def test_the_report_applies_to_each_band_as_the_alignment_did(
+    apart: Made, tmp_path: Path, name: str
+) -> None:
+    report, ours, theirs = (tmp_path / part for part in ("r.json", "one", "other"))
+    geodelreg.write_report(apart.alignment, report)
+    for folder in (ours, theirs):
+        folder.mkdir()
+    warp = name.endswith("tif")
+    geodelreg.write(apart.alignment, theirs / name, warp=warp)
+    command = ["apply", str(report), str(apart.ms), "-o", str(ours / name), "-q"]
+    run = CliRunner().invoke(cli, [*command, *(["--warp"] if warp else [])])
+    assert run.exit_code == 0, run.output
+    found, expected = (
+        sorted((folder / name).iterdir()) if name == "bands" else [folder / name]
+        for folder in (ours, theirs)
+    )
+    assert [path.name for path in found] == [path.name for path in expected]
+    for one, other in zip(found, expected, strict=True):
+        with rasterio.open(one) as a, rasterio.open(other) as b:
+            assert a.transform.almost_equals(b.transform, 1e-6)
+            assert np.abs(a.read().astype(float) - b.read()).max() <= 1
+
+
+@pytest.mark.parametrize("name", ["points.geojson", "points.gpkg", "points.csv"])
+def test_exported_points_tell_their_band_and_refit_each(
+    apart: Made, tmp_path: Path, name: str
+) -> None:
+    points, bands = tmp_path / name, apart.alignment.solution.bands
+    geodelreg.export_gcps(apart.alignment, points)
+    common = geodelreg.refit(points, apart.ms, apart.pan, model="shift")
+    at = lattice()
+    gap = common.solution.map.forward(at) - apart.alignment.solution.map.forward(at)
+    assert np.abs(gap).max() < 1e-6
+    for band in bands:
+        one = geodelreg.refit(points, apart.ms, apart.pan, model="shift", band=band.number)
+        assert np.abs(one.solution.map.forward(at) - band.map.forward(at)).max() < 1e-3
+        assert len(one.tie_points) == apart.alignment.accuracy.kept
+    geodelreg.export_gcps(apart.alignment, tmp_path / "plain.points")
+    lines = (tmp_path / "plain.points").read_text("utf-8").splitlines()
+    assert len(lines) == apart.alignment.accuracy.kept + 2
+
+
+def test_what_has_no_such_bands_is_not_corrected_by_them(apart: Made, tmp_path: Path) -> None:
+    report, mask = tmp_path / "r.json", tmp_path / "mask.tif"
+    geodelreg.write_report(apart.alignment, report)
+    with (
+        rasterio.open(apart.ms) as ms,
+        rasterio.open(mask, "w", **ms.profile | {"count": 1}) as out,
+    ):
+        out.write(ms.read(1), 1)
+    (tmp_path / "points.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(CorrectionMisfitError, match=r"mask\.tif has 1 bands"):
+        geodelreg.apply(report, mask, tmp_path / "out")
+    with pytest.raises(UsageError, match="has no bands"):
+        geodelreg.apply(report, tmp_path / "points.csv", tmp_path / "out.csv")
+    with pytest.raises(UsageError, match="one for all"):
+        geodelreg.apply(report, apart.ms)
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_each_file_of_a_folder_has_its_header_and_the_same_pixels(

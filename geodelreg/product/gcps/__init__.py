@@ -28,7 +28,7 @@ from geodelreg.product.gcps.context import (
     ground_of,
     reading_order,
 )
-from geodelreg.product.gcps.facts import facts_of
+from geodelreg.product.gcps.facts import band_of, facts_of, of_bands
 from geodelreg.values.points import Gcp, TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.result import Alignment
@@ -85,10 +85,14 @@ GCP_FORMATS = {
 }
 
 
+WITH_FIELDS = ("geojson", "csv", "gpkg", "flatgeobuf")
+"""They tell which band a point belongs to."""
 _WITH_REJECTED = ("qgis", "geojson", "gpkg", "flatgeobuf")
 
 
-def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp, ...]:
+def gcps_from_alignment(
+    alignment: Alignment, every: bool = False, bands: bool = False
+) -> tuple[Gcp, ...]:
     """Ground control points of the kept tie points, by MS row, then column.
 
     Parameters
@@ -96,6 +100,8 @@ def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp,
     alignment : Alignment
     every : bool
         Those of the rejected tie points, too.
+    bands : bool
+        After those of the common map those of each band that lies apart.
 
     Returns
     -------
@@ -115,7 +121,7 @@ def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp,
         reference.crs_wkt,
         alignment.source.grid.crs_wkt,
     )
-    return tuple(
+    common = tuple(
         Gcp(
             str(number),
             column,
@@ -134,6 +140,7 @@ def gcps_from_alignment(alignment: Alignment, every: bool = False) -> tuple[Gcp,
             start=1,
         )
     )  # fmt: skip
+    return (*common, *of_bands(alignment, common)) if bands else common
 
 
 def _info(points: TiePoints, index: int) -> str:
@@ -178,7 +185,7 @@ def write_gcps(
         As `write_text_atomically` raises them.
     """
     target = Path(path)
-    name = format or _format_by_extension(target)
+    name = format_of(target, format)
     chosen = _format(name)
     if name not in _WITH_REJECTED and not all(gcp.enabled for gcp in gcps):
         raise GcpFormatError(
@@ -215,8 +222,8 @@ def read_gcps(
     context : GcpContext, optional
         Grids that QGIS (``source``) and ENVI image-to-image files (both) refer to.
     every : bool
-        Also those that are not enabled or were rejected, and those whose pixel of MS is not known
-        (NaN).
+        Also those that are not enabled or were rejected, those of single bands, and those whose
+        pixel of MS is not known (NaN).
 
     Returns
     -------
@@ -231,7 +238,7 @@ def read_gcps(
         more than 50 MB are not read.
     """
     source = Path(path)
-    name = format or _format_by_extension(source)
+    name = format_of(source, format)
     chosen = _format(name)
     content = _content(source, chosen.is_text)
     if format is None and name == "envi" and envi.is_image_to_map(str(content)):
@@ -239,7 +246,7 @@ def read_gcps(
     try:
         gcps, crs_wkt = chosen.decode(content, context)
         if not every:
-            gcps = tuple(gcp for gcp in gcps if gcp.enabled)
+            gcps = tuple(gcp for gcp in gcps if gcp.enabled and not band_of(gcp))
             _check_pixels(gcps)
         return gcps, crs_wkt
     except GcpFormatError as error:
@@ -302,7 +309,15 @@ def _format(name: str) -> GcpFormat:
     return GCP_FORMATS[name]
 
 
-def _format_by_extension(path: Path) -> str:
+def format_of(path: Path, format: str | None = None) -> str:  # noqa: A002 - the field's word
+    """The format named, else that of the extension.
+
+    Raises
+    ------
+    GcpFormatError
+    """
+    if format is not None:
+        return format
     for name, spec in GCP_FORMATS.items():
         if path.suffix.lower() in spec.extensions:
             return name

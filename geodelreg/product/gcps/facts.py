@@ -7,7 +7,8 @@ Lengths that end in ``_px`` are PAN pixels.  `SIGMA_X`, `SIGMA_Y` (units of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,11 @@ from geodelreg.values.points import Gcp
 from geodelreg.values.raster import FloatArray, Grid, IntArray
 from geodelreg.values.result import Alignment
 
-ENABLE, STATUS = "enable", "status"
+ENABLE, STATUS, BAND = "enable", "status", "band"
 SIGMA_X, SIGMA_Y, ERROR_CORRELATION = "sigma_x", "sigma_y", "error_correlation"
 COVARIANCE = (SIGMA_X, SIGMA_Y, ERROR_CORRELATION)
 NAMES = (
-    STATUS, "residual_right_px", "residual_down_px", "sigma_right_px", "sigma_down_px",
+    STATUS, BAND, "residual_right_px", "residual_down_px", "sigma_right_px", "sigma_down_px",
     "correlation", *COVARIANCE,
 )  # fmt: skip
 Facts = tuple[tuple[str, float | None], ...]
@@ -41,14 +42,43 @@ def facts_of(alignment: Alignment, order: IntArray) -> list[Facts]:
     )  # fmt: skip
     rows = np.column_stack(
         [
-            points.status[order], points.residual_px[order], points.sigma_px[order],
-            points.score[order], sigma,
+            points.status[order], np.zeros(len(order)), points.residual_px[order],
+            points.sigma_px[order], points.score[order], sigma,
         ]
     )  # fmt: skip
     return [
         tuple((n, v if math.isfinite(v) else None) for n, v in zip(NAMES, row, strict=True))
         for row in rows.tolist()
     ]
+
+
+def of_bands(alignment: Alignment, gcps: Sequence[Gcp]) -> tuple[Gcp, ...]:
+    """The same points where each band that lies apart shows them.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    gcps : sequence of Gcp
+        Of the common map.
+    """
+    at = np.array([(gcp.column, gcp.row) for gcp in gcps], dtype=np.float64).reshape(-1, 2)
+    header_px = alignment.solution.map.forward(at)
+    return tuple(
+        replace(
+            gcp,
+            id=f"{gcp.id}b{band.number}",
+            column=column,
+            row=row,
+            facts=tuple((dict(gcp.facts) | {BAND: float(band.number)}).items()),
+        )
+        for band in alignment.solution.bands
+        for gcp, (column, row) in zip(gcps, band.map.inverse(header_px).tolist(), strict=True)
+    )
+
+
+def band_of(gcp: Gcp) -> int:
+    """Number of the band that a point belongs to; 0 of the common map of all."""
+    return int(dict(gcp.facts).get(BAND) or 0)
 
 
 def map_covariance(

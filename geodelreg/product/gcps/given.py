@@ -9,7 +9,7 @@ import numpy as np
 from geodelreg.errors import PointsError
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.product.gcps.context import GcpContext, ground_of, pixels_of
-from geodelreg.product.gcps.facts import STATUS, covariance_of
+from geodelreg.product.gcps.facts import STATUS, band_of, covariance_of
 from geodelreg.values.points import GivenPoints, Status
 from geodelreg.values.raster import Grid
 
@@ -19,6 +19,7 @@ def given_points(
     format: str | None,  # noqa: A002 - the field's word
     source: Grid,
     reference: Grid | None,
+    band: int | None,
 ) -> GivenPoints:
     """Read control points, also those that are not enabled.
 
@@ -31,6 +32,8 @@ def given_points(
         Of MS, with its original header.
     reference : Grid, optional
         Of PAN.
+    band : int, optional
+        Take the points of this band, where there are any, instead of those of the common map.
 
     Raises
     ------
@@ -40,6 +43,8 @@ def given_points(
 
     context = GcpContext(source, reference=reference)
     gcps = in_crs_of(source, *read_gcps(path, format, context, every=True))
+    bands = set(map(band_of, gcps))
+    gcps = tuple(gcp for gcp in gcps if band_of(gcp) == (band if band in bands else 0))
     if not gcps:
         raise PointsError(f"{path} has no points", "Name the file that `export_gcps` has written.")
     unit = np.linalg.inv(affine_matrix(source.transform)[:, :2])
