@@ -94,7 +94,7 @@ def _apply_to_raster(
     from geodelreg.geotiff.inplace import edit_in_place
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
-    from geodelreg.product.warp import write_warped
+    from geodelreg.product.warp import grid_asked, write_warped
     from geodelreg.writing_bands import write_apart
 
     with open_raster(file, allow=allow) as reader:
@@ -120,7 +120,8 @@ def _apply_to_raster(
         with together([file]):
             return edit_in_place(file, correction, (), stored.tags)
     out = Path(target)
-    with together([out], lambda: [*input_paths([str(file)], allow), stored.path]):
+    names = [str(file), *([] if options.like is None else [options.like])]
+    with together([out], lambda: [*input_paths(names, allow), stored.path]):
         check_replaceable(out, options.overwrite, stale_beside(out, file))
         if not options.warp:
             return write_corrected(file, out, correction, (), stored.tags, options)
@@ -128,7 +129,7 @@ def _apply_to_raster(
             number: held or AffineMap(~grid.transform @ own.corrected)
             for number, (own, held) in apart.items()
         }
+        options, onto, model = grid_asked(options, stored.reference, None, allow)
         return write_warped(
-            file, out, correction, stored.reference, stored.tags, options,
-            placement=placement, bands=moved,
-        )  # fmt: skip
+            file, out, correction, onto, stored.tags, options, model, placement, moved
+        )

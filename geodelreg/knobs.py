@@ -45,6 +45,7 @@ class WriteKnobs(TypedDict, total=False):
     strip_rpc: bool
     warp: bool
     warp_grid: str
+    like: str | None
     resampling: str
 
 

@@ -242,6 +242,9 @@ class WriteOptions:
     warp_grid: str = _knob(
         "ms", "Grid of `warp`: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
     )
+    like: str | None = _knob(
+        None, "Grid of `warp`: exactly that of this raster, in its CRS, instead of `warp_grid`."
+    )
     resampling: str = _knob(
         "cubic",
         "Resampling of `warp`; quality bands (as QA_PIXEL, SCL) and colour tables keep to nearest.",
@@ -253,6 +256,11 @@ class WriteOptions:
         check_choice(self, "warp_grid")
         check_choice(self, "resampling")
         check_creation(self, "creation_options")
+        if self.like is not None and (not self.warp or self.warp_grid != "ms"):
+            raise UsageError(
+                f"`like={self.like!r}` is the grid of `warp`, in place of `warp_grid`",
+                "Add `warp=True`, and drop `warp_grid`.",
+            )
         if self.warp and self.georef == "gcps":
             raise UsageError(
                 "`warp=True` and `georef='gcps'` exclude each other", "Drop one of them."

@@ -64,7 +64,7 @@ def write(
     from geodelreg.geotiff.corrected import write_corrected
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
-    from geodelreg.product.warp import write_warped
+    from geodelreg.product.warp import grid_asked, write_warped
     from geodelreg.writing_bands import bands_by_file, placed_bands
 
     check_accepted(alignment)
@@ -81,12 +81,15 @@ def write(
         return write_bands(alignment, Path(target), options)
     if not (options.warp or options.georef == "gcps"):
         _check_header_holds(alignment)
-    tags, pan = provenance_tags(alignment), Path(alignment.reference.paths[0])
+    tags, allow = provenance_tags(alignment), alignment.options.allow
+    beside = [] if options.like is None else input_paths([options.like], allow)
+    pan = Path(alignment.reference.paths[0])
+    options, onto, model = grid_asked(options, alignment.reference.grid, pan, allow)
     by_file = bands_by_file(alignment) if options.warp else {}
     notes: list[str] = []
     with (
         _targets(alignment, Path(target)) as pairs,
-        together([out for _, out in pairs], lambda: inputs_of(alignment)),
+        together([out for _, out in pairs], lambda: [*inputs_of(alignment), *beside]),
     ):
         for path, out in pairs:
             check_replaceable(out, options.overwrite, stale_beside(out, path))
@@ -98,16 +101,16 @@ def write(
                     path,
                     out,
                     correction,
-                    alignment.reference.grid,
+                    onto,
                     tags,
                     options,
-                    pan,
+                    model,
                     placement,
                     placed_bands(alignment, by_file.get(path, {}), correction),
                 )
             else:
                 if placement is not None:
-                    gcps = _gcps_of_map(path, placement, alignment.options.allow)
+                    gcps = _gcps_of_map(path, placement, allow)
                 notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
 

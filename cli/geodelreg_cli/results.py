@@ -51,7 +51,8 @@ class Request:
     @property
     def read_beside(self) -> list[str]:
         """What is read beside MS and masks."""
-        return [str(name) for name in (self.reference, self.points_file) if name is not None]
+        names = self.reference, self.points_file, self.write_options.like
+        return [str(name) for name in names if name is not None]
 
 
 def output_params() -> list[SectionOption]:

@@ -6,12 +6,14 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from affine import Affine
 
+from geodelreg.door.names import as_path
 from geodelreg.door.opening import open_raster
 from geodelreg.errors import UnsupportedGeoreferenceError
 from geodelreg.geo.affine import apply_affine
@@ -29,6 +31,7 @@ from geodelreg.masking import flag_bands
 from geodelreg.options import WriteOptions
 from geodelreg.product.lookup import looked_up, lookups_of
 from geodelreg.product.pixels import Parts, Validity, annotate, copy_pixels, profile_of
+from geodelreg.raster.reader import open_raster as open_reader
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Correction
@@ -41,6 +44,27 @@ _EDGE_PLACES = 64  # on each edge of a footprint: what bends curves it
 _EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
 """Of resamplings whose name in rasterio is not GDAL's."""
+
+
+def grid_asked(
+    options: WriteOptions, reference: Grid, path: Path | None, allow: str
+) -> tuple[WriteOptions, Grid, Path | None]:
+    """Options with the grid and the file of the reference; those of ``options.like`` stand for it.
+
+    Parameters
+    ----------
+    options : WriteOptions
+    reference : Grid
+        Of PAN.
+    path : Path, optional
+        PAN.
+    allow : str
+        What may be opened, as in `AlignOptions`.
+    """
+    if options.like is None:
+        return options, reference, path
+    with open_reader(options.like, allow=allow) as reader:
+        return replace(options, like=None, warp_grid="pan"), reader.grid, as_path(options.like)
 
 
 def write_warped(
