@@ -15,14 +15,19 @@ from geodelreg.alignment import Alignment
 from geodelreg.errors import (
     AlignmentRefusedError,
     NoDataError,
-    NoOverlapError,
     UsageError,
 )
 from geodelreg.geotiff.private import unsettled
-from geodelreg.judge.check import is_affine_enough, judge_misalignment, measure_misalignment
+from geodelreg.judge.check import (
+    is_affine_enough,
+    judge_misalignment,
+    measure_band,
+    measure_misalignment,
+    without_one_place,
+)
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
-from geodelreg.pair import Pair, Progress, part_of
+from geodelreg.pair import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.gcps.given import given_points
 from geodelreg.product.provenance import fingerprint, versions
@@ -30,7 +35,7 @@ from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.raster.reader import RasterReader, check_band, open_raster
 from geodelreg.refit_pair import refit_pair
-from geodelreg.values.result import CheckOutcome, Input, Misalignment, Solution
+from geodelreg.values.result import CheckOutcome, Input, Solution
 from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
@@ -164,7 +169,8 @@ def align(
     """
     options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
     with _open(source, reference, options, masks, pan_masks) as rasters:
-        alignment, _ = _examine(rasters, options, progress)
+        pair, solution = _solve(rasters, options, progress)
+        alignment = _alignment(rasters, pair, solution, rasters.notes())
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
         raise AlignmentRefusedError(
@@ -279,7 +285,7 @@ def check(
         The PAN raster.
     options : AlignOptions, optional
         Its `tolerance_px`, `max_residual_px` and `on_local` have no meaning here: whatever is found
-        is measured, and `limit_px` judges it.  With `per_band` each band is also matched by itself.
+        is measured, and `limit_px` judges it.  With `per_band` each band is found, as by `align`.
     limit_px : float
         Largest misalignment, anywhere in the overlap, that counts as aligned, PAN pixels.
     mask, pan_mask : mask or sequence of masks, optional
@@ -306,57 +312,51 @@ def check(
     if not 0.0 <= limit_px <= MAX_LIMIT_PX:
         raise UsageError(f"`limit_px={limit_px}` is out of range", f"Use 0 to {MAX_LIMIT_PX:g}.")
     options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
-    per_band = options.per_band
-    options = replace(
-        options, per_band=False, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn"
-    )
+    options = replace(options, tolerance_px=0.0, max_residual_px=limit_px, on_local="warn")
     with _open(source, reference, options, masks, pan_masks) as rasters:
-        count = len(rasters.ms.band_names) if per_band else 0
-        report = part_of(progress, 0, count + 1)
-        alignment, misalignment = _examine(rasters, options, report)
-        bands = [
-            _check_band(
-                rasters, replace(options, band=n), limit_px, part_of(progress, n, count + 1)
-            )
-            for n in range(1, count + 1)
-        ]
+        pair, solution = _solve(rasters, options, progress)
+        bands = _check_bands(rasters, pair, solution, limit_px) if options.per_band else None
+        solution = without_one_place(pair, solution)
+        alignment = _alignment(rasters, pair, solution, rasters.notes())
+    misalignment = measure_misalignment(pair, solution)
     return Check(
         judge_misalignment(misalignment, limit_px),
         limit_px,
         misalignment,
         is_affine_enough(misalignment, limit_px, alignment.tie_points),
         alignment,
-        tuple(bands) if per_band else None,
+        bands,
     )
 
 
-def _check_band(
-    rasters: _Rasters, options: AlignOptions, limit_px: float, progress: Progress | None
-) -> BandCheck:
-    """One band by itself; a band that shows nothing spoils no other."""
-    assert options.band is not None
-    name = rasters.ms.band_names[options.band - 1]
-    try:
-        pair, solution = align_pair(rasters.ms, rasters.pan, options, progress)
-    except (NoDataError, NoOverlapError) as error:
-        return BandCheck(options.band, name, CheckOutcome.CANNOT_TELL, reason=error.cause)
-    misalignment = measure_misalignment(pair, solution)
-    outcome = judge_misalignment(misalignment, limit_px)
-    alignment = _alignment(rasters, pair, solution)
-    return band_check((options.band, name), alignment, misalignment, limit_px, outcome)
+def _check_bands(
+    rasters: _Rasters, pair: Pair, solution: Solution, limit_px: float
+) -> tuple[BandCheck, ...]:
+    """Each band, as `align` finds it with ``per_band``."""
+    alignment, heard = _alignment(rasters, pair, solution), {b.number: b for b in solution.bands}
+    failed = "; ".join(r.message for r in solution.verdict.reasons if not r.passed)
+    finer = "" if pair.source_is_coarser else ": pixels of PAN are larger"
+    rows = []
+    for number, name in enumerate(rasters.ms.band_names, start=1):
+        band = heard.get(number)
+        if band is None:
+            reason = failed or f"too little tells where it lies{finer}"
+            rows.append(BandCheck(number, name, CheckOutcome.CANNOT_TELL, reason=reason))
+            continue
+        off = measure_band(pair, solution, band)
+        outcome = judge_misalignment(off, limit_px)
+        rows.append(band_check(band, alignment, off, limit_px, outcome))
+    return tuple(rows)
 
 
-def _examine(
+def _solve(
     rasters: _Rasters, options: AlignOptions, progress: Progress | None
-) -> tuple[Alignment, Misalignment]:
-    """Align two open rasters."""
-    ms, pan = rasters.ms, rasters.pan
+) -> tuple[Pair, Solution]:
+    """What the images of two open rasters say."""
     try:
-        pair, solution = align_pair(ms, pan, options, progress, rasters.timings)
+        return align_pair(rasters.ms, rasters.pan, options, progress, rasters.timings)
     except NoDataError as error:
-        raise under_masks(error, ms, pan) from error
-    alignment = _alignment(rasters, pair, solution, rasters.notes())
-    return alignment, measure_misalignment(pair, solution)
+        raise under_masks(error, rasters.ms, rasters.pan) from error
 
 
 def _alignment(

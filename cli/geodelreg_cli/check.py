@@ -68,7 +68,8 @@ def check_params() -> list[SectionOption]:
             ["--per-band"],
             is_flag=True,
             section=VERDICT,
-            help="Also match each MS band by itself; one misaligned band is misaligned (exit 4).",
+            help="Also find each MS band, as align --per-band does; one misaligned band is "
+            "misaligned (exit 4).",
         ),
         SectionOption(
             ["--json"],

@@ -82,7 +82,8 @@ def match_each_band(
     sure = [band for band in fit.bands if fit.is_sure(band)]
     for _ in range(_TOGETHER):
         fit.step(0.0, against=sure)
-    return tuple(fit.band_map(band) for band in fit.bands if fit.is_sure(band))
+    likeness = fit.likeness()
+    return tuple(fit.band_map(band, likeness[band]) for band in fit.bands if fit.is_sure(band))
 
 
 class _Fit:
@@ -112,7 +113,23 @@ class _Fit:
         near = np.abs(self.move[band, :, 0]).max() < _REACH_PX
         return bool(near) and bool(self.sigma_px[band] < _MOST_SIGMA_PX)
 
-    def band_map(self, band: int) -> BandMap:
+    def likeness(self) -> FloatArray:
+        """(B,) correlation of each band with PAN, over the pixels of the tiles."""
+        seen = [(self._images(one), one) for one in self._seen]
+        good = [where & one.good.reshape(where.shape) for (_, where), one in seen]
+        pan = np.concatenate(
+            [one.pan.reshape(w.shape)[w] for w, (_, one) in zip(good, seen, strict=True)]
+        )
+        bands = [
+            np.concatenate(
+                [images[band][w] for w, ((images, _), _) in zip(good, seen, strict=True)]
+            )
+            for band in self.bands
+        ]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.array([np.corrcoef(pan, band)[0, 1] for band in bands])
+
+    def band_map(self, band: int, correlation: float) -> BandMap:
         """What a user is told of a band."""
         pair = self.refined.part.pair
         number = pair.source_bands[band]
@@ -124,6 +141,7 @@ class _Fit:
             name=pair.source.band_names[number - 1],
             map=AffineMap(~Affine(a, b, offset[0], d, e, offset[1])).then(self.common),
             sigma_px=float(self.sigma_px[band]) * pair.pan_px_per_source_px,
+            correlation=float(correlation),
         )
 
     def step(self, blur: float, against: Sequence[int]) -> None:
@@ -145,18 +163,13 @@ class _Fit:
 
     def _systems(self, seen: _Seen, against: Sequence[int]) -> list[_System]:
         """Equations of each band in one tile: its slopes, without what the others explain."""
-        shape = seen.tile.template[0].data.shape
+        images, usable = self._images(seen)
+        shape = usable.shape
         place = (seen.xy - self.centre) / self.span
-        good, images = seen.good.copy(), list[FloatArray]()
-        for pixels, move in zip(seen.tile.template, self.move, strict=True):
-            surface = make_surface(pixels, self.refined.part.template.grid, (self._blur,) * 2)
-            at = seen.xy + move[:, 0] + place @ move[:, 1:].T
-            image, usable = sample(surface, at[:, None])
-            images.append(np.asarray(image.reshape(shape), dtype=np.float64))
-            good &= usable[:, 0]
+        good = seen.good.reshape(shape) & usable
         basis = np.stack([np.ones(len(place)), *place.T]).reshape(3, *shape)
         slopes = np.stack([self._slopes(band, image, basis) for band, image in enumerate(images)])
-        pan, patches = seen.pan.reshape(shape), _patches(good.reshape(shape), self.refined.size)
+        pan, patches = seen.pan.reshape(shape), _patches(good, self.refined.size)
         found = []
         for rows, columns, inside in patches:
             here = [image[rows, columns][inside] for image in images]
@@ -167,6 +180,19 @@ class _Fit:
                 known = np.stack([*level, *(here[number] for number in others)], axis=1)
                 found.append(_unexplained(here[band], steep[band], known, steep[others]))
         return found
+
+    def _images(self, seen: _Seen) -> tuple[list[FloatArray], BoolArray]:
+        """Each band of a tile as far as it has found its place, and where all are known."""
+        shape = seen.tile.template[0].data.shape
+        place = (seen.xy - self.centre) / self.span
+        known, images = np.ones(len(place), dtype=np.bool_), list[FloatArray]()
+        for pixels, move in zip(seen.tile.template, self.move, strict=True):
+            surface = make_surface(pixels, self.refined.part.template.grid, (self._blur,) * 2)
+            at = seen.xy + move[:, 0] + place @ move[:, 1:].T
+            image, usable = sample(surface, at[:, None])
+            images.append(np.asarray(image.reshape(shape), dtype=np.float64))
+            known &= usable[:, 0]
+        return images, known.reshape(shape)
 
     def _slopes(self, band: int, image: FloatArray, basis: FloatArray) -> FloatArray:
         """(K, H, W) derivatives of a band's image by all unknowns."""

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from geodelreg.fine.layers import LOCAL_RMS_PX, many_elsewhere
-from geodelreg.judge.verdict import SIGNIFICANCE
-from geodelreg.judge.words import local_distortion
+from geodelreg.judge.verdict import SIGNIFICANCE, bands_reason
+from geodelreg.judge.words import lies, local_distortion
 from geodelreg.pair import Pair, overlap_corners, roles
 from geodelreg.values.points import TiePoints
-from geodelreg.values.result import CheckOutcome, Misalignment, Solution
+from geodelreg.values.result import (
+    BandMap,
+    CheckOutcome,
+    Misalignment,
+    Outcome,
+    Solution,
+    Verdict,
+)
 
 
 def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
@@ -34,6 +43,38 @@ def measure_misalignment(pair: Pair, solution: Solution) -> Misalignment:
         residual_interval_px=solution.accuracy.residual_interval_px,
         moved="".join(moved),
     )
+
+
+def without_one_place(pair: Pair, solution: Solution) -> Solution:
+    """The solution, refused where its bands lie so far apart that no one place is right for all.
+
+    Parameters
+    ----------
+    pair : Pair
+    solution : Solution
+        With the bands that were found one by one.
+    """
+    worst, words = 0.0, ""
+    for one, other in combinations(solution.bands, 2):
+        gap = pair.move_px(one.map, pair.source_centre) - pair.move_px(
+            other.map, pair.source_centre
+        )
+        doubt = SIGNIFICANCE * math.hypot(one.sigma_px, other.sigma_px)
+        apart = float(np.hypot(*gap[0])) - doubt
+        if apart > worst:
+            worst, words = apart, f"{one.name} {lies(gap[0], other.name)}"
+    reason = bands_reason(worst, words)
+    if reason.passed:
+        return solution
+    refused = Verdict(Outcome.REFUSED, (*solution.verdict.reasons, reason))
+    return replace(solution, verdict=refused)
+
+
+def measure_band(pair: Pair, solution: Solution, band: BandMap) -> Misalignment:
+    """Largest displacement of one band; what is local it has of the common map."""
+    moved = replace(solution, map=band.map)
+    whole = measure_misalignment(pair, moved)
+    return replace(whole, sigma_px=math.hypot(whole.sigma_px, band.sigma_px))
 
 
 def judge_misalignment(misalignment: Misalignment, limit_px: float) -> CheckOutcome:

@@ -42,6 +42,7 @@ _LAST_LIMITS = (
 """After what the user asked; unexplained: ablate."""
 _OF_BANDS = ("bands_apart", "bands")
 """Not asked where each band is corrected by itself."""
+_BANDS_APART = "PAN px at least between the places of two MS bands"
 _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
 SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
@@ -144,7 +145,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     repeated = _MAX_LOG_TOGETHER if evidence.repeated is not None else None
     whole = (
         ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
-        ("bands", "≤", MAX_BANDS_PX, f"PAN px at least between the places of two MS bands{which}"),
+        ("bands", "≤", MAX_BANDS_PX, f"{_BANDS_APART}{which}"),
         _strain_limit(evidence.strain),
         ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
         ("local", "≤", most_px, "PAN px RMS at least is left of the ground's bend"),
@@ -206,6 +207,11 @@ def _strain_limit(strain: float) -> tuple[str, str, float | None, str]:
 def passes(reasons: tuple[Reason, ...]) -> bool:
     """True when nothing speaks against a correction."""
     return all(reason.passed for reason in reasons)
+
+
+def bands_reason(apart_px: float, words: str) -> Reason:
+    """The reason of MS bands that were found one by one, and lie at least so far apart."""
+    return _reason("bands", apart_px, "≤", MAX_BANDS_PX, f"{_BANDS_APART}: {words}")
 
 
 def nothing_agrees() -> Reason:

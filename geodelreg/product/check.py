@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import accuracy_line, json_text, masks_line, plain, report_dict, short
-from geodelreg.values.result import Alignment, CheckOutcome, Misalignment
+from geodelreg.values.result import Alignment, BandMap, CheckOutcome, Misalignment
 
 _UNKNOWN = float("nan")
 _NOTHING_KNOWN = Misalignment()
@@ -23,7 +23,7 @@ _WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class BandCheck:
-    """What one MS band, matched by itself, says.  NaN = not known.
+    """What one MS band says, found beside the others.  NaN = not known.
 
     Attributes
     ----------
@@ -121,19 +121,19 @@ def explanation(
 
 
 def band_check(
-    band: tuple[int, str],
+    band: BandMap,
     alignment: Alignment,
     misalignment: Misalignment,
     limit_px: float,
     outcome: CheckOutcome,
 ) -> BandCheck:
-    """Row of one band, given by number and name, out of its own alignment."""
+    """Row of one band that was found beside the others of an alignment."""
+    solution = replace(alignment.solution, map=band.map)
+    shift_px = header_motion(replace(alignment, solution=solution)).shift_px
     reason = explanation(outcome, misalignment, alignment, limit_px)
-    if not alignment.verdict.accepted:
-        return BandCheck(*band, outcome, reason=reason)
     return BandCheck(
-        *band, outcome, misalignment, header_motion(alignment).shift_px,
-        alignment.accuracy.sigma_centre_px, alignment.accuracy.ncc_after, reason,
+        band.number, band.name, outcome, misalignment, shift_px, band.sigma_px,
+        band.correlation, reason,
     )  # fmt: skip
 
 

@@ -202,12 +202,15 @@ class BandMap:
         Its MS pixels to MS header pixels.
     sigma_px : float
         Standard error of the place at the raster's centre, PAN pixels.
+    correlation : float
+        With PAN, where it lies; NaN when not known.
     """
 
     number: int
     name: str
     map: PixelMap
     sigma_px: float
+    correlation: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

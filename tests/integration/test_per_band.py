@@ -150,6 +150,23 @@ def test_exported_points_tell_their_band_and_refit_each(
     assert len(lines) == apart.alignment.accuracy.kept + 2
 
 
+def test_check_shares_the_estimate_and_searches_once(
+    apart: Made, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", "geodelreg"):
+        found = geodelreg.check(apart.ms, apart.pan, per_band=True)
+    assert sum(record.getMessage().startswith("guess from") for record in caplog.records) == 1
+    said = report_dict(apart.alignment)["bands"]
+    assert found.bands is not None
+    assert [band.number for band in found.bands] == [band["number"] for band in said]
+    for band, other in zip(found.bands, said, strict=True):
+        assert np.abs(np.subtract(band.shift_px, other["shift_px"])).max() < 1e-9
+        assert band.sigma_px == other["sigma_px"]
+        assert 0.5 < band.correlation <= 1
+    assert found.raster_outcome.value == "cannot_tell"
+    assert "PAN px at least between the places of two MS bands" in found.reason
+
+
 def test_what_has_no_such_bands_is_not_corrected_by_them(apart: Made, tmp_path: Path) -> None:
     report, mask = tmp_path / "r.json", tmp_path / "mask.tif"
     geodelreg.write_report(apart.alignment, report)
