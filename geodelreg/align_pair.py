@@ -23,9 +23,11 @@ from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fine.per_band import match_each_band
 from geodelreg.fine.settle import settle
 from geodelreg.fit.choice import Fitted, half_disagreement, select_for
-from geodelreg.fit.field import halves_apart, selection_of
+from geodelreg.fit.field import facets_of, halves_apart, selection_of
 from geodelreg.fit.models import Frame, points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
+from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.evidence import gather
 from geodelreg.judge.verdict import (
     clouds_in_the_way,
@@ -38,7 +40,7 @@ from geodelreg.judge.verdict import (
 )
 from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import bands_warning, unheard_bands, warnings_of
-from geodelreg.options import BEYOND_A_HEADER, AlignOptions
+from geodelreg.options import BEYOND_A_HEADER, FOLLOWING, AlignOptions
 from geodelreg.pair import Pair, Progress, make_pair, overlap_corners, roles
 from geodelreg.values.points import NO_TIE_POINTS, Guess, Status, TiePoints
 from geodelreg.values.raster import StatusArray, WindowReader
@@ -246,7 +248,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
             closer = whole if everyone is None else whole.under(pair, everyone.map)
             clouds = whole.clouds
             may_follow = may_bend(options) and clouds <= LEAST_SHARE
-            follows = may_follow and (bent or options.model == "field" or closer.is_bent(options))
+            follows = may_follow and (bent or options.model in FOLLOWING or closer.is_bent(options))
             if everyone is not None and not follows:
                 again = gather(guess, refined, everyone, heard)
                 if passes(judge(again[1], options)):
@@ -266,7 +268,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
                 bands = match_each_band(refined, fitted.map, model, options.band_model)
         notes += unheard_bands(pair, bands)
     moves = any(moves_pair(pair, one) for one in (fitted.map, *(band.map for band in bands)))
-    if options.model == "field" and model != "field" and passes(reasons):
+    if options.model in FOLLOWING and model != options.model and passes(reasons):
         in_the_way = clouds > LEAST_SHARE
         why = clouds_in_the_way(clouds) if in_the_way else too_few_for_a_field(accuracy.kept)
         reasons = (*reasons, why)
@@ -296,7 +298,7 @@ def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
 
 def may_bend(options: AlignOptions) -> bool:
     """True when a field was asked for, or may be written where one affine is not enough."""
-    asked = options.model == "field" or (options.model == "auto" and options.on_local == "field")
+    asked = options.model in FOLLOWING or (options.model == "auto" and options.on_local == "field")
     return asked and options.method == "delaunay"
 
 
@@ -310,9 +312,12 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         settled = settle(refined, whole.field or fitted.map)
         if settled is None:
             return refined, fitted
-        refined, field = settled.refined, settled.fit.field
+        refined, fit = settled.refined, settled.fit
+        field: FieldMap | TinMap = fit.field
+        if pair.options.model == "tin":
+            field = facets_of(field.source, field.target, field.noise_px2)
         tied = tie_points(refined.part, settled.matched, field, settled.status)
-        selection = selection_of(settled.fit, Frame.of(pair))
+        selection = selection_of(field, fit.distance2[fit.inlier], Frame.of(pair))
         apart_px = pair.pan_px_per_source_px * halves_apart(field)
         # a field follows its points: those that it has not seen say what chance would do
         unseen = tied.residual_px.copy()

@@ -21,8 +21,10 @@ from geodelreg.option_checks import (
 )
 
 METHODS = ("delaunay", "zhang2013", "sift")
-MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective", "field")
-BEYOND_A_HEADER = ("projective", "field")
+MODELS = ("auto", "shift", "scale", "similarity", "affine", "projective", "field", "tin")
+FOLLOWING = ("field", "tin")
+"""Models that follow what bends."""
+BEYOND_A_HEADER = ("projective", *FOLLOWING)
 """Models that no geotransform can hold."""
 GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
@@ -56,7 +58,8 @@ class AlignOptions:
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
         "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
-        "projective one or a field, which follows what bends: MS is then resampled.",
+        "projective one, a field, which follows what bends, or tin, the paper's facets, for "
+        "comparison: MS is then resampled.",
         MODELS,
     )
     north_up: bool = _knob(
@@ -183,9 +186,9 @@ class AlignOptions:
                 "Use auto, shift or scale.",
             )
         check_range(self, "threads", 0, 1024)
-        if self.model == "field" and self.method != "delaunay":
+        if self.model in FOLLOWING and self.method != "delaunay":
             raise UsageError(
-                f"`method={self.method!r}` knows no field",
+                f"`method={self.method!r}` knows no {self.model}",
                 "Use `method='delaunay'`, or another model.",
             )
 

@@ -13,16 +13,17 @@ from geodelreg.errors import PointsError
 from geodelreg.fine.snap import snap_points
 from geodelreg.fit.choice import Selection, select_for
 from geodelreg.fit.estimate import Observations, minimum_points
-from geodelreg.fit.field import FEWEST_POINTS, fit_field, selection_of
+from geodelreg.fit.field import FEWEST_POINTS, facets_of, fit_field, selection_of
 from geodelreg.fit.jumps import find_jumps
 from geodelreg.fit.models import Frame, design
 from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.accuracy import measure_points
 from geodelreg.judge.evidence import turn_and_scale
 from geodelreg.judge.verdict import judge_motion, moves_pair, verdict
 from geodelreg.judge.whole import largest_strain
 from geodelreg.judge.words import warnings_of
-from geodelreg.options import AlignOptions
+from geodelreg.options import FOLLOWING, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, roles
 from geodelreg.values.points import GivenPoints, Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
@@ -161,7 +162,7 @@ def _check_enough(given: GivenPoints, points: Observations, model: str) -> None:
             f"(`model={model!r}` needs {fewest})",
             "Add or enable points, or take a simpler model.",
         )
-    plane = "affine" if model in ("auto", "field") and len(points) > _FEWEST_AUTO + 1 else model
+    plane = "affine" if model in ("auto", *FOLLOWING) and len(points) > _FEWEST_AUTO + 1 else model
     if plane in ("auto", "shift"):
         return
     low, high = points.source.min(axis=0), points.source.max(axis=0)
@@ -184,8 +185,13 @@ def _fit(pair: Pair, given: GivenPoints, points: Observations, used: BoolArray) 
         jumps = find_jumps(points.take(fit.inlier), fit.field.kernel, fit.weight)
         if jumps:
             fit = fit_field(points, fit.field.kernel, jumps)
-        selection = selection_of(fit, Frame.of(pair))
+        selection = selection_of(fit.field, fit.distance2[fit.inlier], Frame.of(pair))
         inlier = fit.inlier
+    elif pair.options.model == "tin":
+        noise = points.covariance[:, (0, 1), (0, 1)]
+        facets = facets_of(points.source, points.target, noise)
+        selection = selection_of(facets, selection.estimate.distance2, Frame.of(pair))
+        inlier = np.ones(len(points), dtype=np.bool_)
     else:
         inlier = selection.estimate.inlier
     lattice = np.concatenate([pair.source_lattice(LATTICE), points.source])
@@ -207,7 +213,7 @@ def _conclude(
     correction, model = fit.selection.estimate.map, fit.selection.estimate.model
     points = _tie_points(pair, given, fit)
     accuracy = measure_points(roles(pair), points, fit.selection)
-    strain = largest_strain(pair, correction) if isinstance(correction, FieldMap) else 0.0
+    strain = largest_strain(pair, correction) if isinstance(correction, FieldMap | TinMap) else 0.0
     shift_px = float(np.hypot(*pair.move_px(correction, pair.source_centre)[0]))
     reasons = judge_motion(shift_px, *turn_and_scale(pair, correction), strain, pair.options)
     names = {"enabled": int(given.enabled.sum()), "kept": accuracy.kept}

@@ -17,6 +17,7 @@ from geodelreg.fit.estimate import (
     weighted_fit,
 )
 from geodelreg.fit.models import MODEL_ORDER, NORTH_UP, Frame, fitted_map
+from geodelreg.options import FOLLOWING
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
@@ -198,7 +199,7 @@ def select_model(
 
 
 def select_for(pair: Pair, points: Observations) -> Selection:
-    """`select_model` as the options of a pair ask; a field starts from an affine.
+    """`select_model` as the options of a pair ask; what follows a bend starts from an affine.
 
     Parameters
     ----------
@@ -206,7 +207,7 @@ def select_for(pair: Pair, points: Observations) -> Selection:
     points : Observations
     """
     asked, frame, ratio = pair.options, Frame.of(pair), pair.pan_px_per_source_px
-    model = "affine" if asked.model == "field" else asked.model
+    model = "affine" if asked.model in FOLLOWING else asked.model
     tilt = math.inf if asked.north_up else _TILT_PX / ratio
     return select_model(points, frame, pair.source_lattice(2), model, _NEGLIGIBLE_PX / ratio, tilt)
 

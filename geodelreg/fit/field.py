@@ -15,6 +15,7 @@ from geodelreg.fit.estimate import Estimate, Observations
 from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel, distances, solve_axis
+from geodelreg.geo.maps.tin import TinMap
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 FEWEST_POINTS = 12
@@ -31,6 +32,10 @@ _LEAST_NUGGET_PX2 = 1e-7  # unexplained: ablate
 _STEPS = 20  # unexplained: ablate
 _CLOSE = 1e-5  # relative: a hundredth of the likelihood that one unit of a kernel is worth
 _DIGITS = 2  # of the logarithms of a kernel: a percent, far below what points tell of it
+
+
+Follower = FieldMap | TinMap
+"""Maps through points that follow what bends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,7 +189,24 @@ def _spacing(points: Observations) -> float:
     return float(np.sqrt(extent[0] * extent[1] / len(points)))
 
 
-def held_out_errors(field: FieldMap) -> FloatArray:
+def facets_of(source: FloatArray, target: FloatArray, noise_px2: FloatArray) -> TinMap:
+    """Facets through points, as uncertain as each is for a mesh without it.
+
+    Parameters
+    ----------
+    source, target : (N, 2) float64
+    noise_px2 : (N, 2) float64
+        Of the points alone, which knows nothing of what bends within a facet.
+    """
+    plain = TinMap(source, target, noise_px2)
+    error2 = held_out_errors(plain) ** 2
+    known = np.isfinite(error2).all(axis=1)
+    return (
+        replace(plain, noise_px2=noise_px2 + error2[known].mean(axis=0)) if known.any() else plain
+    )
+
+
+def held_out_errors(field: Follower) -> FloatArray:
     """(N, 2) errors of the field at its points, each predicted without all of its block.
 
     NaN where too few points are left.  The kernel is that of all points: four numbers of hundreds.
@@ -198,24 +220,26 @@ def held_out_errors(field: FieldMap) -> FloatArray:
     return error
 
 
-def selection_of(fit: FieldFit, frame: Frame) -> Selection:
-    """A fitted field as a model with its held-out errors, at the points that it stands on.
+def selection_of(field: Follower, distance2: FloatArray, frame: Frame) -> Selection:
+    """What follows a bend as a model with its held-out errors, at the points that it stands on.
 
     Parameters
     ----------
-    fit : FieldFit
+    field : FieldMap or TinMap
+    distance2 : (N,) float64
+        Of the points from what the others say, squared, in variances.
     frame : Frame
         Of MS.
     """
-    field, distance2, none = fit.field, fit.distance2[fit.inlier], np.empty(0)
-    all_of_them = np.ones(len(field.source), dtype=np.bool_)
-    estimate = Estimate(
-        "field", field, none, none, frame, field.kernel.nugget_px2, all_of_them, distance2
+    model, extra = (
+        ("field", field.kernel.nugget_px2) if isinstance(field, FieldMap) else ("tin", 0.0)
     )
+    none, all_of_them = np.empty(0), np.ones(len(field.source), dtype=np.bool_)
+    estimate = Estimate(model, field, none, none, frame, extra, all_of_them, distance2)
     return Selection(estimate, HeldOut(held_out_errors(field), distance2))
 
 
-def halves_apart(field: FieldMap) -> float:
+def halves_apart(field: Follower) -> float:
     """Largest distance over the points between fields through two disjoint halves, over two.
 
     The halves interleave, so that both cover the scene.
@@ -227,8 +251,8 @@ def halves_apart(field: FieldMap) -> float:
     return float(np.hypot(*(one - other).T).max() / 2)
 
 
-def _without(field: FieldMap, out: BoolArray) -> FieldMap:
-    """The same kernel on the other points."""
+def _without(field: Follower, out: BoolArray) -> Follower:
+    """The same on the other points; of a field with its kernel."""
     return replace(
         field, source=field.source[~out], target=field.target[~out], noise_px2=field.noise_px2[~out]
     )

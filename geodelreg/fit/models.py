@@ -18,6 +18,7 @@ import numpy as np
 from geodelreg.geo.affine import affine_from_matrix
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.projective import ProjectiveMap
+from geodelreg.options import FOLLOWING
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray
@@ -33,8 +34,8 @@ PARAMETER_COUNT = {
 
 
 def points_that_fix(model: str) -> int:
-    """Points that determine a model; of a field its trend, an affine."""
-    return PARAMETER_COUNT["affine" if model == "field" else model] // 2
+    """Points that determine a model; of one that follows what bends its trend, an affine."""
+    return PARAMETER_COUNT["affine" if model in FOLLOWING else model] // 2
 
 
 @dataclass(frozen=True, slots=True)

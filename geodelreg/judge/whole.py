@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from geodelreg.fit.field import FEWEST_POINTS, fit_field
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.evidence import decimated
 from geodelreg.judge.verdict import Evidence
 from geodelreg.judge.words import lies, region
@@ -125,11 +127,12 @@ class Whole:
     def followed(self, pair: Pair, fitted: Fitted) -> Whole:
         """The same of a field, which leaves what neighbouring patches still share."""
         points, field = fitted.points, fitted.map
-        if not isinstance(field, FieldMap):
+        if not isinstance(field, FieldMap | TinMap):
             return self
         near = shared_by_neighbours(points.source_px[points.kept], points.residual_px[points.kept])
         strain = largest_strain(pair, field)
-        return replace(self, residual=near, field=field, strain=strain)
+        known = field if isinstance(field, FieldMap) else None
+        return replace(self, residual=near, field=known, strain=strain)
 
     def under(self, pair: Pair, correction: PixelMap) -> Whole:
         """The same of another correction."""
@@ -137,10 +140,11 @@ class Whole:
         return replace(self, residual=_left(pair, self.field, correction))
 
 
-def largest_strain(pair: Pair, field: FieldMap) -> float:
-    """Of a field, at its points and over MS."""
-    places = np.concatenate([field.source, pair.source_lattice(_STRAIN_PLACES)])
-    return float(field.strain_at(places)[0].max())
+def largest_strain(pair: Pair, field: FieldMap | TinMap) -> float:
+    """Of what follows a bend, where it may bend most and over MS; infinite where it folds."""
+    places = np.concatenate([field.places, pair.source_lattice(_STRAIN_PLACES)])
+    strain, growth = field.strain_at(places)
+    return float(strain.max()) if (growth > 0).all() else math.inf
 
 
 def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Whole:

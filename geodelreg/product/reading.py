@@ -17,6 +17,7 @@ from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.lattice import OnLattice
 from geodelreg.geo.maps.projective import ProjectiveMap
+from geodelreg.geo.maps.tin import TinMap
 from geodelreg.masking import MaskUse
 from geodelreg.options import AlignOptions
 from geodelreg.product.report import SCHEMA_VERSION
@@ -137,6 +138,8 @@ def _pixel_map(said: Mapping[str, Any], sigma: OnLattice | None = None) -> Pixel
     kind = said["kind"]
     if kind == "field":
         return FieldMap.from_json(said)
+    if kind == "tin":
+        return TinMap.from_json(said)
     if kind == "composed":
         first, second = map(_pixel_map, said["maps"])
         return first.then(second)

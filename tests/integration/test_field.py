@@ -92,6 +92,16 @@ def test_waves_are_followed_and_the_standard_error_is_right(
     assert followed.accuracy.residual_rms_px < 0.1
 
 
+def test_facets_follow_worse_and_say_so(wavy: Made, followed: Alignment) -> None:
+    facets = geodelreg.align(wavy.ms, wavy.pan, model="tin")
+    assert facets.solution.model == "tin"
+    at = check_points(wavy.pair.scene.truth.ms_shape)
+    error, best = wavy.errors_px(facets, at), wavy.errors_px(followed, at)
+    assert 2 * rms(best) < rms(error) < 0.3
+    sigma = RATIO * facets.solution.map.sigma_at(at)
+    assert 0.5 < np.sqrt(((error**2).sum(axis=1) / sigma**2).mean()) < 1.6
+
+
 def test_without_an_output_for_it_the_refusal_names_what_carries_a_field(wavy: Made) -> None:
     with pytest.raises(AlignmentRefusedError, match="of the ground's bend") as caught:
         geodelreg.align(wavy.ms, wavy.pan)

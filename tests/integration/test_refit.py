@@ -16,6 +16,7 @@ from affine import Affine
 from click.testing import CliRunner, Result
 from numpy.typing import NDArray
 from rasterio.warp import transform
+from scipy.interpolate import LinearNDInterpolator
 
 import geodelreg
 from geodelreg.errors import AlignmentRefusedError, GcpFormatError, PointsError
@@ -276,6 +277,36 @@ def test_a_field_follows_points_that_bend(tmp_path: Path) -> None:
     refused = run("refit", points, MS, "--model", "field", "-o", out)
     assert (code(refused), out.exists()) == (2, False)
     assert run("refit", points, MS, "--model", "field", "-o", out, "--warp", "-q").exit_code == 0
+
+
+def test_facets_pass_through_every_point(tmp_path: Path) -> None:
+    """Within the mesh scipy's piecewise linear interpolation; beyond it nothing jumps."""
+    rng = np.random.default_rng(3)
+    pixels = [(float(c), float(r)) for c, r in rng.uniform(5, 150, (60, 2))]
+
+    def bent(column: float, row: float) -> tuple[float, float]:
+        return TRUE @ (column + 0.4 * np.sin(row / 40), row + 0.4 * np.cos(column / 40))
+
+    points, out = write_csv(tmp_path / "bent.csv", rows_at(pixels, bent)), tmp_path / "out.tif"
+    found = geodelreg.refit(points, MS, model="tin")
+    at, header = rng.uniform(0, 160, (4000, 2)), found.source.grid.transform
+    target = np.array([~header @ bent(*pixel) for pixel in pixels])
+    expected = LinearNDInterpolator(np.array(pixels), target)(at)
+    inside = np.isfinite(expected).all(axis=1)
+    assert 0.5 < inside.mean() < 1
+    placed = found.solution.map.forward(at)
+    assert np.abs(placed - expected)[inside].max() < 1e-9
+    assert np.abs(found.solution.map.inverse(placed) - at).max() < 1e-6
+    near = found.solution.map.forward(at + 1e-4) - placed
+    assert np.abs(near - 1e-4).max() < 3e-5
+    report = tmp_path / "r.json"
+    geodelreg.write_report(found, report)
+    geodelreg.write(found, out, warp=True)
+    geodelreg.apply(report, MS, tmp_path / "again.tif", geodelreg.WriteOptions(warp=True))
+    with rasterio.open(out) as one, rasterio.open(tmp_path / "again.tif") as other:
+        assert np.array_equal(one.read(), other.read())
+    jsonschema.validate(json.loads(report.read_text("utf-8")), report_schema())
+    assert code(run("refit", points, MS, "--model", "tin", "-o", tmp_path / "no.tif")) == 2
 
 
 BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] = {

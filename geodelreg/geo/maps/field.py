@@ -112,6 +112,11 @@ class FieldMap(SmoothMap):
             parts.append(axis.variance * prior - known.T @ known + lack.T @ lack)
         return np.stack(parts)
 
+    @property
+    def places(self) -> FloatArray:
+        """(N, 2) where it is likely to bend most: its points."""
+        return self.source
+
     def strain_at(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Largest strain beyond the points' affine, and the determinant over its, both (N,)."""
         beyond = self.linearise(xy)[:, :, :2] @ np.linalg.inv(self._affine)
