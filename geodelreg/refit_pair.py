@@ -35,6 +35,7 @@ _LEAST_PX = 0.05  # of MS, where no point says how sure it is: their spread tell
 _SAME_PX = 1e-3  # of MS: two points at one place
 _LINE = 1e-3  # of the extent of the points: nearer to a line they fix no model of the plane
 _DOUBTFUL_PX = 0.7  # of PAN, as the gate's
+_MOST_SCALE = 2.0  # of pixels; no header is so wrong, but the points of another raster are
 _FEWEST_AUTO = 2  # the shift
 _NAMED = 10  # points at most in one message
 
@@ -202,6 +203,13 @@ def _fit(pair: Pair, given: GivenPoints, points: Observations, used: BoolArray) 
             "Look for points that were mixed up (`model='shift'` names the worst), or for columns "
             "that were exchanged.",
         )
+    scale = turn_and_scale(pair, selection.estimate.map)[1]
+    if pair.options.max_scale is None and scale > _MOST_SCALE:
+        raise PointsError(
+            f"{given.file}: by the points, pixels of {pair.source.name} are {scale:.3g} times as "
+            "large or small as its header says: they are those of another raster",
+            "Name the raster that the points were made for, or allow it with `max_scale`.",
+        )
     kept = used.copy()
     kept[used] = inlier
     return _Fit(selection, kept)
@@ -258,7 +266,7 @@ def _warnings(given: GivenPoints, points: TiePoints, sigma_px: float, with_pan: 
             f"{unsure.sum()} points were placed by hand ({_listed(given, unsure)}): they count as "
             f"{_BY_EYE_PX:g} coarser px uncertain"
         )
-    far = points.status == Status.RESIDUAL
+    far = given.enabled & (points.status == Status.RESIDUAL)
     if far.any():
         notes.append(f"{far.sum()} enabled points lie far from the fit: {_listed(given, far)}")
     if sigma_px > _DOUBTFUL_PX:

@@ -309,6 +309,17 @@ def test_facets_pass_through_every_point(tmp_path: Path) -> None:
     assert code(run("refit", points, MS, "--model", "tin", "-o", tmp_path / "no.tif")) == 2
 
 
+def test_a_scale_that_no_header_is_wrong_by_is_refused(tmp_path: Path) -> None:
+    def coarser(column: float, row: float) -> tuple[float, float]:
+        return TRUE @ (2.5 * column - 80, 2.5 * row - 80)
+
+    points = write_csv(tmp_path / "coarser.csv", rows_at(SPREAD, coarser))
+    with pytest.raises(PointsError, match=r"2\.5 times as large or small"):
+        geodelreg.refit(points, MS, model="affine")
+    found = geodelreg.refit(points, MS, model="affine", max_scale=3)
+    assert found.at_centre.scale[0] == pytest.approx(2.5, abs=0.01)
+
+
 BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] = {
     "on a line": (
         lambda: rows_at([(float(i), 2.0 * i) for i in range(5, 60, 5)], truly), (), "on a line"
@@ -342,6 +353,35 @@ BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] 
         "standard errors -1",
     ),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["all.geojson", "all.gpkg", "p.csv", "p.points"])
+def test_points_of_another_raster_are_told(exported: Path, tmp_path: Path, name: str) -> None:
+    """PAN, and a part of MS; QGIS points hold places by the header, which are right in the part."""
+    part = tmp_path / "part.tif"
+    with rasterio.open(MS) as ms:
+        moved = ms.transform @ Affine.translation(8, 6)
+        shape = {"width": ms.width - 8, "height": ms.height - 6}
+        profile = ms.profile | shape | {"transform": moved}
+        with rasterio.open(part, "w", **profile) as out:
+            out.write(ms.read()[:, 6:, 8:])
+    if name.endswith("points"):
+        found = geodelreg.refit(exported / name, part, model="affine").correction.corrected
+        assert apart_px(found, header(exported / "kept.tif") @ Affine.translation(8, 6)) < 0.01
+        return
+    for raster in (PAN, part):
+        with pytest.raises(PointsError, match="are those of another raster, or of this one"):
+            geodelreg.refit(exported / name, raster, PAN)
+
+
+def test_a_pixel_that_was_typed_anew_is_placed_by_hand(exported: Path, tmp_path: Path) -> None:
+    with (exported / "p.csv").open(newline="") as stream:
+        rows: list[dict[str, Any]] = list(csv.DictReader(stream))
+    rows[9]["column"] = float(rows[9]["column"]) + 0.8
+    edited = write_csv(tmp_path / "edited.csv", rows)
+    found = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
+    assert any(note.startswith("1 of 1 points placed by hand") for note in found.warnings)
+    assert error_px(found, "9") < 0.2
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from geodelreg.errors import GcpFormatError
-from geodelreg.geo.affine import affine_matrix
+from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.values.points import Gcp
@@ -23,10 +23,12 @@ from geodelreg.values.result import Alignment
 
 ENABLE, STATUS, BAND = "enable", "status", "band"
 SIGMA_X, SIGMA_Y, ERROR_CORRELATION = "sigma_x", "sigma_y", "error_correlation"
+HEADER = ("header_x", "header_y")
+"""Map position of the pixel by the original header: of which raster the point is."""
 COVARIANCE = (SIGMA_X, SIGMA_Y, ERROR_CORRELATION)
 NAMES = (
     STATUS, BAND, "residual_right_px", "residual_down_px", "sigma_right_px", "sigma_down_px",
-    "correlation", *COVARIANCE,
+    "correlation", *COVARIANCE, *HEADER,
 )  # fmt: skip
 Facts = tuple[tuple[str, float | None], ...]
 
@@ -44,6 +46,7 @@ def facts_of(alignment: Alignment, order: IntArray) -> list[Facts]:
         [
             points.status[order], np.zeros(len(order)), points.residual_px[order],
             points.sigma_px[order], points.score[order], sigma,
+            apply_affine(alignment.source.grid.transform, points.source_px[order]),
         ]
     )  # fmt: skip
     return [
@@ -62,18 +65,16 @@ def of_bands(alignment: Alignment, gcps: Sequence[Gcp]) -> tuple[Gcp, ...]:
         Of the common map.
     """
     at = np.array([(gcp.column, gcp.row) for gcp in gcps], dtype=np.float64).reshape(-1, 2)
-    header_px = alignment.solution.map.forward(at)
-    return tuple(
-        replace(
-            gcp,
-            id=f"{gcp.id}b{band.number}",
-            column=column,
-            row=row,
-            facts=tuple((dict(gcp.facts) | {BAND: float(band.number)}).items()),
-        )
-        for band in alignment.solution.bands
-        for gcp, (column, row) in zip(gcps, band.map.inverse(header_px).tolist(), strict=True)
-    )
+    header_px, found = alignment.solution.map.forward(at), []
+    for band in alignment.solution.bands:
+        pixels = band.map.inverse(header_px)
+        places = apply_affine(alignment.source.grid.transform, pixels)
+        for gcp, (column, row), (x, y) in zip(gcps, pixels.tolist(), places.tolist(), strict=True):
+            known = dict(gcp.facts) | {BAND: float(band.number)}
+            facts = tuple((known | dict(zip(HEADER, (x, y), strict=True))).items())
+            name = f"{gcp.id}b{band.number}"
+            found.append(replace(gcp, id=name, column=column, row=row, facts=facts))
+    return tuple(found)
 
 
 def band_of(gcp: Gcp) -> int:

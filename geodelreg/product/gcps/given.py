@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +11,11 @@ import numpy as np
 from geodelreg.errors import PointsError
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.product.gcps.context import GcpContext, ground_of, pixels_of
-from geodelreg.product.gcps.facts import STATUS, band_of, covariance_of
-from geodelreg.values.points import GivenPoints, Status
+from geodelreg.product.gcps.facts import COVARIANCE, HEADER, STATUS, band_of, covariance_of
+from geodelreg.values.points import Gcp, GivenPoints, Status
 from geodelreg.values.raster import Grid
+
+_SAME_PX = 0.01  # of MS, between a pixel and where the header of its raster had it
 
 
 def given_points(
@@ -47,6 +51,7 @@ def given_points(
     gcps = tuple(gcp for gcp in gcps if band_of(gcp) == (band if band in bands else 0))
     if not gcps:
         raise PointsError(f"{path} has no points", "Name the file that `export_gcps` has written.")
+    gcps = _of_raster(path, gcps, source)
     unit = np.linalg.inv(affine_matrix(source.transform)[:, :2])
     covariance = np.stack([covariance_of(gcp, str(path)) for gcp in gcps])
     facts = [dict(gcp.facts) for gcp in gcps]
@@ -63,4 +68,30 @@ def given_points(
         score,
         enabled,
         np.array(status, dtype=np.uint8),
+    )
+
+
+def _of_raster(path: Path, gcps: Sequence[Gcp], source: Grid) -> tuple[Gcp, ...]:
+    """The points, those whose pixel was edited without standard errors.
+
+    Raises
+    ------
+    PointsError
+        Most were made for another raster, or one with another header.
+    """
+    said = [[dict(gcp.facts).get(name) for name in HEADER] for gcp in gcps]
+    there = apply_affine(~source.transform, np.array(said, dtype=np.float64).reshape(-1, 2))
+    gap = np.abs(there - pixels_of(gcps)).max(axis=1)
+    elsewhere = gap > _SAME_PX
+    if elsewhere.sum() > np.isfinite(gap).sum() / 2:
+        raise PointsError(
+            f"{path}: {elsewhere.sum()} of {np.isfinite(gap).sum()} points are those of another "
+            "raster, or of this one with another header",
+            "Name the raster that the points were made for, with its original header.",
+        )
+    return tuple(
+        replace(gcp, facts=tuple(fact for fact in gcp.facts if fact[0] not in COVARIANCE))
+        if moved
+        else gcp
+        for gcp, moved in zip(gcps, elsewhere.tolist(), strict=True)
     )
