@@ -70,15 +70,17 @@ def _open(
     options: AlignOptions,
     masks: Sequence[AnyMask],
     pan_masks: Sequence[AnyMask],
+    *,
+    alone: bool = False,
 ) -> Iterator[_Rasters]:
-    """The rasters; without a reference MS stands for it."""
+    """The rasters; where MS is `alone` it stands for the reference."""
     timings, allow = Timings(), options.allow
     with ExitStack() as stack:
         with timings("open"):
             ms = pan = stack.enter_context(
                 open_raster(source, [*options.masks, *masks], allow=allow)
             )
-            if reference is not None:
+            if not alone:
                 pan = stack.enter_context(
                     open_raster(reference, [*options.pan_masks, *pan_masks], allow=allow)
                 )
@@ -243,8 +245,9 @@ def refit(
     if options.per_band:
         raise UsageError("`per_band=True` has no meaning for points", "Drop it.")
     file = Path(points)
-    with _open(source, reference, options, masks, pan_masks) as rasters:
-        pan = None if reference is None else rasters.pan
+    alone = reference is None
+    with _open(source, reference, options, masks, pan_masks, alone=alone) as rasters:
+        pan = None if alone else rasters.pan
         pan_grid = None if pan is None else pan.grid
         given = given_points(file, format, rasters.ms.grid, pan_grid, options.band)
         pair, solution = refit_pair(
