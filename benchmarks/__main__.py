@@ -16,6 +16,10 @@ COMMANDS = {
     ),
     "field": ("benchmarks.accuracy.field", "pairs that bend and jump, against the known truth"),
     "bound": ("benchmarks.accuracy.bound", "errors against the Cramér–Rao bound"),
+    "unshared": (
+        "benchmarks.accuracy.unshared",
+        "the standard error where PAN and MS see different light",
+    ),
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),

@@ -257,6 +257,8 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
                 refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
                 accuracy, evidence = gather(guess, refined, fitted, heard)
                 whole = whole.followed(pair, fitted)
+            else:
+                whole = whole.at_best(pair)
             accuracy, evidence = whole.added_to(accuracy, evidence)
             notes = whole.warnings(options)
         notes += bands_warning(evidence)

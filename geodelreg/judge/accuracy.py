@@ -10,6 +10,7 @@ import numpy as np
 from geodelreg.fine.overlay import Overlay
 from geodelreg.fit.choice import HeldOut, Selection
 from geodelreg.geo.grid import outline
+from geodelreg.judge.unshared import PULL_PX
 from geodelreg.pair import Pair, Roles, overlap_corners
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
@@ -27,11 +28,19 @@ by about this much of a pixel of the coarser image, per pair (docs/gate.md says 
 
 
 def measure(
-    part: Roles, points: TiePoints, selection: Selection, before: Overlay, after: Overlay
+    part: Roles,
+    points: TiePoints,
+    selection: Selection,
+    before: Overlay,
+    after: Overlay,
+    unshared: float,
 ) -> Accuracy:
-    """Accuracy in PAN pixels and metres, at points the fit has not seen where it says check."""
+    """Accuracy in PAN pixels and metres, at points the fit has not seen where it says check.
+
+    `unshared` is the share of what patches show that one image shows alone.
+    """
     return replace(
-        measure_points(part, points, selection),
+        measure_points(part, points, selection, unshared),
         e1_before=grey_rmse(before, part.ms_is_template),
         e1_after=grey_rmse(after, part.ms_is_template),
         ncc_before=correlation(before),
@@ -39,7 +48,9 @@ def measure(
     )
 
 
-def measure_points(part: Roles, points: TiePoints, selection: Selection) -> Accuracy:
+def measure_points(
+    part: Roles, points: TiePoints, selection: Selection, unshared: float = 0.0
+) -> Accuracy:
     """What the points alone say of it; what needs the images is not known."""
     pair, kept = part.pair, points.kept
     correction = selection.estimate.map
@@ -47,7 +58,7 @@ def measure_points(part: Roles, points: TiePoints, selection: Selection) -> Accu
     fit = points.residual_px[kept]
     check_px, check_m = _held_out(pair, points, selection.check, selection)
     ratio = pair.pan_px_per_source_px
-    floor = SYSTEMATIC_PX * pair.pan_px_per_coarser_px
+    floor = math.hypot(SYSTEMATIC_PX, PULL_PX * math.sqrt(unshared)) * pair.pan_px_per_coarser_px
     pan_m = float(np.sqrt(pair.reference_gsd_m[0] * pair.reference_gsd_m[1]))
     return Accuracy(
         fit_rmse_px=_rms(fit),
@@ -63,6 +74,7 @@ def measure_points(part: Roles, points: TiePoints, selection: Selection) -> Accu
             ratio * selection.neglected_px,
             floor,
         ),
+        systematic_px=floor,
         coverage=_coverage(part, points, correction),
         kept=int(kept.sum()),
         checked=int(np.isfinite(check_px).all(axis=1).sum()),

@@ -22,6 +22,7 @@ from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
 from geodelreg.judge.in_place import AreaEvidence, area_evidence
 from geodelreg.judge.repeated import proof_without_repeated
 from geodelreg.judge.rival import Rival, rival_correlation
+from geodelreg.judge.unshared import unshared_share
 from geodelreg.judge.verdict import Evidence
 from geodelreg.judge.words import BANDS_TOLD_PX
 from geodelreg.pair import Pair
@@ -53,7 +54,8 @@ def gather(
 
     def overlaid() -> tuple[Accuracy, Rival]:
         before, after, wide = _overlays(guess, refined, correction)
-        accuracy = measure(part, fitted.points, fitted.selection, before, after)
+        unshared = unshared_share(refined, correction, fitted.points)
+        accuracy = measure(part, fitted.points, fitted.selection, before, after, unshared)
         return accuracy, rival_correlation(wide)
 
     def in_place() -> AreaEvidence:

@@ -22,6 +22,7 @@ from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import FEWEST_POINTS, fit_field
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
+from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.evidence import decimated
@@ -81,6 +82,21 @@ class Whole:
         """True when those that agree leave more of the ground's bend than is allowed."""
         known = self.field is not None and not self.moved
         return known and self.residual.low_px > options.max_residual_px
+
+    def at_best(self, pair: Pair) -> Whole:
+        """The same of the affine that leaves least of the whole, where that is too much as well.
+
+        Those that agree may be a part whose map fits the rest badly; what is refused then is bent
+        ground and not that map.
+        """
+        if not self.is_bent(pair.options) or pair.options.on_local != "refuse":
+            return self
+        assert self.field is not None
+        at = _sample(self.field)
+        columns = np.column_stack([at, np.ones(len(at))])
+        matrix = np.asarray(np.linalg.lstsq(columns, self.field.forward(at), rcond=None)[0].T)
+        best = self.under(pair, AffineMap.of(matrix))
+        return best if best.is_bent(pair.options) else self
 
     def status(self, last: StatusArray) -> StatusArray:
         """Status of the patches of the last pass when all of the ground is heard."""
@@ -294,9 +310,12 @@ def _bent(
 
 
 def _left(pair: Pair, field: FieldMap, correction: PixelMap) -> Residual:
-    at = field.source
-    at = at[:: 1 + len(at) // _PLACES]
-    return residual_of(field, correction, at, _in_pan(pair))
+    return residual_of(field, correction, _sample(field), _in_pan(pair))
+
+
+def _sample(field: FieldMap) -> FloatArray:
+    """(N, 2) some 200 places in sight."""
+    return field.source[:: 1 + len(field.source) // _PLACES]
 
 
 def _in_pan(pair: Pair) -> FloatArray:

@@ -92,7 +92,8 @@ def displacement(alignment: Alignment, at: FloatArray, metres: FloatArray) -> Fl
     side = apply_affine(source.transform, at + np.array([1.0, 0.0]))
     wide = apply_affine(~reference.transform, map_points(side, source.crs_wkt, reference.crs_wkt))
     unit = np.hypot(*(wide - one).T)
-    return np.column_stack([(after - before) * metres, other - one, sigma * unit])
+    sigma_px = np.hypot(sigma * unit, alignment.accuracy.systematic_px if sigma.any() else 0.0)
+    return np.column_stack([(after - before) * metres, other - one, sigma_px])
 
 
 def read_displacement(path: Path) -> tuple[FloatArray, Grid]:

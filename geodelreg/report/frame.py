@@ -67,5 +67,7 @@ def frame_of(alignment: Alignment) -> Frame:
     whole = Window(0, 0, reference.shape[1], reference.shape[0])
     scale = scale if np.isfinite(scale) else 1.0
     spots = lattice(source.shape)
-    sigma = OnLattice(found.sigma_at(spots.reshape(-1, 2)).reshape(spots.shape[:2]), source.shape)
+    alike = np.nan_to_num(alignment.accuracy.systematic_px) / scale
+    errors = np.hypot(found.sigma_at(spots.reshape(-1, 2)), alike)
+    sigma = OnLattice(errors.reshape(spots.shape[:2]), source.shape)
     return Frame(header, found, sigma, window or whole, scale, (width, height))

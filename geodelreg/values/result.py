@@ -153,6 +153,8 @@ class Accuracy:
         Of the kept tie points under the original header.
     sigma_centre_px, sigma_corner_px : float
         Standard error of the correction (radial) at the MS raster's centre and worst corner.
+    systematic_px : float
+        What of it moves all patches alike, and no residual shows.
     coverage : float
         Share of the overlap's area inside the hull of the kept points, 0 to 1.
     e1_before, e1_after : float
@@ -177,6 +179,7 @@ class Accuracy:
     before_rmse_m: float = float("nan")
     sigma_centre_px: float = float("nan")
     sigma_corner_px: float = float("nan")
+    systematic_px: float = float("nan")
     coverage: float = float("nan")
     e1_before: float = float("nan")
     e1_after: float = float("nan")

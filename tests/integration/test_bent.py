@@ -96,6 +96,14 @@ def test_waves_are_refused_with_what_they_leave_and_what_helps(wavy: Made) -> No
     jsonschema.validate(report_dict(alignment), report_schema())
 
 
+def test_what_is_left_is_that_of_the_best_affine_where_a_part_alone_agrees(tmp_path: Path) -> None:
+    wavy = made(tmp_path, waves(3.0, 565.0, np.random.default_rng(0)))
+    _, alignment = refusal(wavy)
+    assert failed(alignment) == {"local"}
+    best = wavy.rms_px(wavy.pair.best_affine())
+    assert alignment.accuracy.residual_rms_px == pytest.approx(best, rel=0.1)
+
+
 def test_waves_are_written_when_told_by_the_best_affine_of_the_whole(
     wavy: Made, tmp_path: Path
 ) -> None:
