@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
 from geodelreg.fit.choice import spatial_blocks
+from geodelreg.geo.crs import map_points
+from geodelreg.geo.footprint import overlap_windows
 from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
 from geodelreg.values.points import TiePoints
@@ -18,6 +20,7 @@ _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
 BANDS_TOLD_PX = 0.5  # of PAN: half of what refuses
 _MOSTLY = 0.9  # unexplained: ablate
+_METRES_PER_KM = 1000.0  # by definition
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
 
@@ -35,12 +38,7 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
     without_bright : bool
         Bright objects were left out, because they move differently.
     """
-    notes: list[str] = []
-    if not pair.source_is_coarser:
-        notes.append(
-            f"MS pixels ({pair.source_gsd_m[0]:.4g} m) are finer than the reference's "
-            f"({pair.reference_gsd_m[0]:.4g} m): matched at the reference's resolution"
-        )
+    notes = list(_doubts(pair, points))
     if pair.header.operation.warning:
         notes.append(pair.header.operation.warning)
     names, asked = pair.source.band_names, bands_asked(pair.source, pair.options)
@@ -70,6 +68,36 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
             "those of the others; over terrain a local warp would be needed"
         )
     return tuple(notes)
+
+
+def _doubts(pair: Pair, points: TiePoints) -> Iterator[str]:
+    """What looks as if something else had been meant: questions, for the answer may be yes."""
+    source, reference = pair.source, pair.reference
+    ours, theirs = len(source.band_names), len(reference.band_names)
+    swapped = not pair.source_is_coarser and ours == 1 < theirs
+    if not pair.source_is_coarser:
+        yield (
+            f"MS pixels ({pair.source_gsd_m[0]:.4g} m) are finer than the reference's "
+            f"({pair.reference_gsd_m[0]:.4g} m): matched at the reference's resolution"
+        )
+    if swapped:
+        yield (
+            f"MS has one band and PAN {theirs}, of larger pixels: are the two swapped? MS, which "
+            "is corrected, comes first"
+        )
+    elif theirs > 1 and pair.options.pan_band == 1:
+        yield (
+            f"PAN has {theirs} bands, and the first ({reference.band_names[0]}) was matched on: is "
+            "it the right one? `pan_band=N` takes another"
+        )
+    kept = points.kept
+    if kept.any() and overlap_windows(source.grid, reference.grid, 0.0, map_points) is None:
+        moves = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
+        far_km = float(np.median(np.hypot(*(moves * pair.reference_gsd_m).T))) / _METRES_PER_KM
+        yield (
+            f"the headers put MS {far_km:.3g} km away from PAN, where the two do not overlap: is "
+            "the CRS of MS, its UTM zone for instance, the right one?"
+        )
 
 
 def unheard_bands(pair: Pair, bands: Sequence[BandMap]) -> tuple[str, ...]:
