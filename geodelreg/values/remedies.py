@@ -8,7 +8,8 @@ _REMEDIES = (
     (
         {"local"},
         (
-            "`warp=True` writes a field that follows the bend, `georef='gcps'` its control points; "
+            "`warp=True` writes a field that follows the bend, `georef='gcps'` its control points, "
+            "and a sharpened GeoTIFF (pansharpen) follows it; "
             "`on_local='warn'` writes the best affine all the same, `max_residual_px` allows more; "
             "a raster that is bent less in parts can be cut (gdal_translate -srcwin) and aligned "
             "part by part."
