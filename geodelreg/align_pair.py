@@ -283,7 +283,8 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         verdict=verdict(reasons, moves),
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
-        warnings=warnings_of(pair, model, fitted.points, refined.without_bright) + notes,
+        warnings=warnings_of(pair, model, fitted.points, without_bright=refined.without_bright)
+        + notes,
         search=guess.search,
         bands=bands,
     )

@@ -235,7 +235,7 @@ def _conclude(
         warnings=(
             *notes,
             *_warnings(given, points, accuracy.sigma_corner_px, with_pan),
-            *warnings_of(pair, model, points, without_bright=False),
+            *warnings_of(pair, model, points, matched=False),
         ),
         search="points",
     )

@@ -25,7 +25,9 @@ _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
 
 
-def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool) -> tuple[str, ...]:
+def warnings_of(
+    pair: Pair, model: str, points: TiePoints, *, without_bright: bool = False, matched: bool = True
+) -> tuple[str, ...]:
     """What a user should be warned of, in plain words.
 
     Parameters
@@ -37,15 +39,18 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
         With residuals under the correction.
     without_bright : bool
         Bright objects were left out, because they move differently.
+    matched : bool
+        False of points that were given: nothing is said of how the images were matched.
     """
-    notes = list(_doubts(pair, points))
+    notes = list(_doubts_of_match(pair)) if matched else []
+    notes += _doubts_of_place(pair, points)
     if pair.header.operation.warning:
         notes.append(pair.header.operation.warning)
     names, asked = pair.source.band_names, bands_asked(pair.source, pair.options)
-    if len(asked) < len(names) and not pair.options.band:
+    if matched and len(asked) < len(names) and not pair.options.band:
         notes.append(f"{len(asked)} of {len(names)} bands of MS, evenly spread, were looked at")
     left_out = [names[number - 1] for number in asked if number not in pair.source_bands]
-    if left_out:
+    if matched and left_out:
         notes.append(f"{', '.join(left_out)} of MS showed too little to be matched on")
     if without_bright:
         notes.append("bright objects (clouds?) move differently from the ground and were left out")
@@ -70,7 +75,7 @@ def warnings_of(pair: Pair, model: str, points: TiePoints, without_bright: bool)
     return tuple(notes)
 
 
-def _doubts(pair: Pair, points: TiePoints) -> Iterator[str]:
+def _doubts_of_match(pair: Pair) -> Iterator[str]:
     """What looks as if something else had been meant: questions, for the answer may be yes."""
     source, reference = pair.source, pair.reference
     ours, theirs = len(source.band_names), len(reference.band_names)
@@ -90,7 +95,11 @@ def _doubts(pair: Pair, points: TiePoints) -> Iterator[str]:
             f"PAN has {theirs} bands, and the first ({reference.band_names[0]}) was matched on: is "
             "it the right one? `pan_band=N` takes another"
         )
-    kept = points.kept
+
+
+def _doubts_of_place(pair: Pair, points: TiePoints) -> Iterator[str]:
+    """Whether the headers are of the same world."""
+    source, reference, kept = pair.source, pair.reference, points.kept
     if kept.any() and overlap_windows(source.grid, reference.grid, 0.0, map_points) is None:
         moves = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
         far_km = float(np.median(np.hypot(*(moves * pair.reference_gsd_m).T))) / _METRES_PER_KM

@@ -85,6 +85,7 @@ def test_unedited_points_give_the_correction_again(
     assert done.exit_code == 0, done.output
     assert apart_px(header(out), header(exported / "kept.tif")) < within_px
     assert ("PAN px" in done.stderr) == bool(pan)
+    assert "matched on" not in done.stderr  # nothing was matched, so no band of PAN is asked about
     with rasterio.open(out) as written, rasterio.open(MS) as ms:
         assert np.array_equal(written.read(), ms.read())
         assert written.tags()["GEODELREG_POINTS"] == name
