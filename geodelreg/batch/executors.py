@@ -101,8 +101,16 @@ class DaskWorkers:
         """Four pairs for each thread that the cluster has now; it may grow and shrink."""
         if self._count:
             return self._count
-        threads = sum(self._client.nthreads().values())
-        return max(_PER_THREAD * int(threads), _PER_THREAD)
+        return max(_PER_THREAD * self._cores(), _PER_THREAD)
+
+    def _cores(self) -> int:
+        """Threads of all workers; a scheduler that ends meanwhile resets the connection."""
+        try:
+            return int(sum(self._client.nthreads().values()))
+        except (OSError, TimeoutError) as error:  # CommClosedError is an OSError, too
+            raise ClusterError(
+                f"the connection to Dask's scheduler is lost ({error})", _RESUME
+            ) from error
 
     def submit(self, text: str) -> Future[str]:
         """Let a task run."""
@@ -118,7 +126,7 @@ class DaskWorkers:
             raise ClusterError(
                 f"the connection to Dask's scheduler is {self._client.status}", _RESUME
             )
-        if not (self._client.nthreads() or self._alone):
+        if not (self._cores() or self._alone):
             self._alone = True
             logger.warning("the cluster has no workers now; the pairs wait for some")
 
