@@ -101,13 +101,13 @@ class DaskWorkers:
         """Four pairs for each thread that the cluster has now; it may grow and shrink."""
         if self._count:
             return self._count
-        return max(_PER_THREAD * self._cores(), _PER_THREAD)
+        return max(_PER_THREAD * self._threads_there(), _PER_THREAD)
 
-    def _cores(self) -> int:
+    def _threads_there(self) -> int:
         """Threads of all workers; a scheduler that ends meanwhile resets the connection."""
         try:
             return int(sum(self._client.nthreads().values()))
-        except (OSError, TimeoutError) as error:  # CommClosedError is an OSError, too
+        except OSError as error:  # a timeout and Dask's CommClosedError are such, too
             raise ClusterError(
                 f"the connection to Dask's scheduler is lost ({error})", _RESUME
             ) from error
@@ -126,7 +126,7 @@ class DaskWorkers:
             raise ClusterError(
                 f"the connection to Dask's scheduler is {self._client.status}", _RESUME
             )
-        if not (self._cores() or self._alone):
+        if not (self._threads_there() or self._alone):
             self._alone = True
             logger.warning("the cluster has no workers now; the pairs wait for some")
 

@@ -112,6 +112,19 @@ def own_name(name: str, driver: str) -> Iterator[str]:
         _own.reset(token)
 
 
+@contextmanager
+def opened_vrt(text: str) -> Iterator[DatasetReader]:
+    """A virtual raster of the program's own that is in no file, open."""
+    from rasterio.io import MemoryFile
+
+    with (
+        MemoryFile(text.encode(), ext=".vrt") as memory,
+        own_name(memory.name, "VRT") as name,
+        open_raster(name) as dataset,
+    ):
+        yield dataset
+
+
 def look_at(name: str, allow: str) -> Entry:
     """Look at everything behind a name, before GDAL does.
 

@@ -21,7 +21,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from geodelreg.door.opening import open_raster, own_name
+from geodelreg.door.opening import open_raster, opened_vrt
 from geodelreg.geotiff.environment import gdal_session, thread_count
 from geodelreg.product.common_grid import Recipe, covered
 from geodelreg.product.pixels import Validity
@@ -211,7 +211,7 @@ def _tile(
         ]
         placed = [Source(name, 1, one.kind) for name, one in zip(bands, spectral, strict=True)]
         text = pansharpened_xml(placed, Source(pan, 1), weights, bit_depth=bit_depth)
-        data = stack.enter_context(_in_memory(text)).read()
+        data = stack.enter_context(opened_vrt(text)).read()
     valid = [_covered(inputs[path], pixels, path, source, window) for path, source in recipe.covers]
     return data, np.logical_and.reduce(valid)
 
@@ -260,16 +260,3 @@ def _held(pixels: NDArray[Any], nodata: float | None, stack: ExitStack) -> str:
     with memory.open(driver="GTiff", count=1, transform=placed, nodata=nodata, **profile) as file:
         file.write(pixels, 1)
     return str(memory.name)
-
-
-@contextmanager
-def _in_memory(text: str) -> Iterator[Any]:
-    """A virtual raster that is in no file, open."""
-    from rasterio.io import MemoryFile
-
-    with (
-        MemoryFile(text.encode(), ext=".vrt") as memory,
-        own_name(memory.name, "VRT") as name,
-        open_raster(name) as dataset,
-    ):
-        yield dataset

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 from affine import Affine
 
-from geodelreg.door.opening import open_raster, own_name
+from geodelreg.door.opening import opened_vrt
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.geo.maps.spline import FINEST_PX, MARGIN, axes, interpolated
@@ -137,11 +137,7 @@ def looked_up(name: str, warped: Any, lookup: Lookup) -> Iterator[Any]:
         with memory.open(**profile, dtype="float64", transform=placed) as array:
             array.write(np.moveaxis(lookup.nodes, -1, 0) - [[[0.0]], [[lookup.rows[0]]]])
         _look_up(root, name, memory.name, lookup, warped.src_dataset.shape)
-        with (
-            MemoryFile(ElementTree.tostring(root), ext=".vrt") as bent,
-            own_name(bent.name, "VRT") as own,
-            open_raster(own) as dataset,
-        ):
+        with opened_vrt(ElementTree.tostring(root, encoding="unicode")) as dataset:
             yield dataset
 
 

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from geodelreg.geo.maps.kriging import Axis, Kernel, distances, solve_axis
-from geodelreg.geo.maps.smooth import SmoothMap
+from geodelreg.geo.maps.smooth import SmoothMap, point_rows, points_of_rows, solved
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, IntArray
 
 _AT_ONCE = 500_000  # distances: they stay in the cache
 _INVERSE_STEPS = 30  # each shrinks an error at least to the strain's share
-_INVERSE_PX = 1e-9  # far below what anyone sees, far above rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,14 +146,13 @@ class FieldMap(SmoothMap):
 
     def to_json(self) -> dict[str, Any]:
         """All that it is made of; every point as source, target and variances."""
-        rows = np.concatenate([self.source, self.target, self.noise_px2], axis=1)
         return {
             "kind": "field",
             "range_px": self.kernel.range_px,
             "variance_px2": list(self.kernel.variance_px2),
             "nugget_px2": self.kernel.nugget_px2,
             "jump_rows": list(self.jumps),
-            "points": rows.tolist(),
+            "points": point_rows(self.source, self.target, self.noise_px2),
         }
 
     @classmethod
@@ -166,12 +164,10 @@ class FieldMap(SmoothMap):
         KeyError, TypeError, ValueError
             Of what `to_json` has not made.
         """
-        rows = np.array(said["points"], dtype=np.float64)
         one, other = said["variance_px2"]
         kernel = Kernel(float(said["range_px"]), (float(one), float(other)), said["nugget_px2"])
         jumps = tuple(float(row) for row in said["jump_rows"])
-        source, target, noise = (np.ascontiguousarray(part) for part in np.hsplit(rows, 3))
-        return cls(source, target, noise, kernel, jumps)
+        return cls(*points_of_rows(said["points"]), kernel, jumps)
 
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
@@ -242,21 +238,14 @@ class FieldMap(SmoothMap):
         return out
 
     def _inverse_of_part(self, goal: FloatArray, part: int) -> FloatArray:
-        """(M, 2) source pixels by Newton's method with one slope for all; NaN where it ends not."""
-        number = np.full(len(goal), part)
-        back = np.linalg.inv(self._affine).T
+        """(M, 2) source pixels of one part; NaN where none is found."""
+        back: FloatArray = np.asarray(np.linalg.inv(self._affine).T, dtype=np.float64)
         offset = self._mapped(np.zeros((1, 2)), np.array([part]))[0]
-        at = (goal - offset) @ back
-        gap = np.full(goal.shape, np.inf)
-        going = np.flatnonzero(np.isfinite(at).all(axis=1))
-        for _ in range(_INVERSE_STEPS):
-            if not len(going):
-                break
-            gap[going] = self._mapped(at[going], number[going]) - goal[going]
-            at[going] -= gap[going] @ back
-            going = going[np.abs(gap[going]).max(axis=1) > _INVERSE_PX]
-        at[~(np.abs(gap).max(axis=1) <= _INVERSE_PX)] = np.nan
-        return np.asarray(at)
+
+        def forward(xy: FloatArray) -> FloatArray:
+            return self._mapped(xy, np.full(len(xy), part))
+
+        return solved(forward, goal, (goal - offset) @ back, back, _INVERSE_STEPS)
 
     def _slices(self, count: int) -> list[slice]:
         step = max(_AT_ONCE // len(self.source), 1)

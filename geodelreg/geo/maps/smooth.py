@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from geodelreg.values.raster import FloatArray
 _STEP_PX = 4.0
 """Half width of the differences that linearise: of pixels, over which headers hardly curve, and
 wide enough that the rounding of coordinates of 10⁷ m (10⁻⁹ m) is lost."""
+_SOLVED_PX = 1e-9  # far below what anyone sees, far above rounding
 
 
 class SmoothMap(ABC):
@@ -143,6 +144,58 @@ class Inverse(SmoothMap):
         """The inverse, where the other is affine."""
         affine = self.of.as_affine()
         return None if affine is None else ~affine
+
+
+def solved(
+    forward: Callable[[FloatArray], FloatArray],
+    goal: FloatArray,
+    start: FloatArray,
+    back: FloatArray,
+    steps: int,
+) -> FloatArray:
+    """(M, 2) places that a map sends to (M, 2) goals; NaN where it ends not.
+
+    Newton's method with one slope for all.
+
+    Parameters
+    ----------
+    forward : callable
+        Of (K, 2) places.
+    goal, start : (M, 2) float64
+    back : (2, 2) float64
+        What turns a gap in the goal into one in the place, on the right.
+    steps : int
+        At most; each shrinks an error at least to the strain's share.
+    """
+    at, gap = start.copy(), np.full(goal.shape, np.inf)
+    going = np.flatnonzero(np.isfinite(at).all(axis=1))
+    for _ in range(steps):
+        if not len(going):
+            break
+        gap[going] = forward(at[going]) - goal[going]
+        at[going] -= gap[going] @ back
+        going = going[np.abs(gap[going]).max(axis=1) > _SOLVED_PX]
+    at[~(np.abs(gap).max(axis=1) <= _SOLVED_PX)] = np.nan
+    return at
+
+
+def point_rows(source: FloatArray, target: FloatArray, noise_px2: FloatArray) -> list[list[float]]:
+    """Points of a map for JSON: source, target and variances in a row."""
+    rows: list[list[float]] = np.concatenate([source, target, noise_px2], axis=1).tolist()
+    return rows
+
+
+def points_of_rows(rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Source, target and variances again.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Of what `point_rows` has not made.
+    """
+    parts = np.hsplit(np.array(rows, dtype=np.float64), 3)
+    source, target, noise = (np.ascontiguousarray(part) for part in parts)
+    return source, target, noise
 
 
 def _magnification(of: PixelMap, xy: FloatArray) -> FloatArray:

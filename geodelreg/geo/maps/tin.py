@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geodelreg.geo.maps.smooth import SmoothMap
+from geodelreg.geo.maps.smooth import SmoothMap, point_rows, points_of_rows, solved
 from geodelreg.values.raster import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from scipy.spatial import Delaunay
 
 _INVERSE_STEPS = 40  # each shrinks an error at least to the strain's share
-_INVERSE_PX = 1e-9  # far below what anyone sees, far above rounding
 _SLIVER = 0.1  # of the longest side: a height below it
 _AT_ONCE = 20_000  # places beyond the mesh that are compared with its edges: they fit in memory
 
@@ -52,17 +51,8 @@ class TinMap(SmoothMap):
     def inverse(self, xy: FloatArray) -> FloatArray:
         """(..., 2) source pixels of (..., 2) header pixels; NaN where it is not found."""
         goal = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
-        back = np.linalg.inv(self._trend[:2]).T
-        at = (goal - self._trend[2]) @ back.T
-        gap = np.full(goal.shape, np.inf)
-        going = np.flatnonzero(np.isfinite(at).all(axis=1))
-        for _ in range(_INVERSE_STEPS):
-            if not len(going):
-                break
-            gap[going] = self.forward(at[going]) - goal[going]
-            at[going] -= gap[going] @ back.T
-            going = going[np.abs(gap[going]).max(axis=1) > _INVERSE_PX]
-        at[~(np.abs(gap).max(axis=1) <= _INVERSE_PX)] = np.nan
+        back: FloatArray = np.asarray(np.linalg.inv(self._trend[:2]), dtype=np.float64)
+        at = solved(self.forward, goal, (goal - self._trend[2]) @ back, back, _INVERSE_STEPS)
         return np.asarray(at.reshape(np.shape(xy)))
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
@@ -94,8 +84,7 @@ class TinMap(SmoothMap):
 
     def to_json(self) -> dict[str, Any]:
         """Every point as source, target and variances."""
-        rows = np.concatenate([self.source, self.target, self.noise_px2], axis=1)
-        return {"kind": "tin", "points": rows.tolist()}
+        return {"kind": "tin", "points": point_rows(self.source, self.target, self.noise_px2)}
 
     @classmethod
     def from_json(cls, said: Mapping[str, Any]) -> TinMap:
@@ -106,9 +95,7 @@ class TinMap(SmoothMap):
         KeyError, TypeError, ValueError
             Of what `to_json` has not made.
         """
-        rows = np.array(said["points"], dtype=np.float64)
-        source, target, noise = (np.ascontiguousarray(part) for part in np.hsplit(rows, 3))
-        return cls(source, target, noise)
+        return cls(*points_of_rows(said["points"]))
 
     @cached_property
     def _mesh(self) -> Delaunay:
