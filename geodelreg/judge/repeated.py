@@ -19,16 +19,10 @@ from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tuning import lattice
 from geodelreg.geo.affine import apply_affine
 from geodelreg.judge.in_place import area_evidence
+from geodelreg.values.drawn import SAMPLES, drawn_values
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray
+from geodelreg.values.raster import Band, BoolArray, FloatArray
 
-_SAMPLES = 60_000  # of each image: a drawn value is then seen a hundred times
-_LEAST_SHARE = 0.002
-"""Of the pixels that one value must have: twelve small labels have ten times as many."""
-_SPIKE = 8.0
-"""Times as frequent as the values beside it: of ground, neighbours are about as frequent, also in
-eight bit, where a sensor is stretched, or where little is shown."""
-_BESIDE = 8  # values on either side that occur
 _TOGETHER = 0.5
 """Share of the drawn pixels of the coarser image that must lie on such of the finer one."""
 
@@ -87,26 +81,12 @@ def proof_without_repeated(refined: Refinement, correction: PixelMap, sample_siz
 
 def _drawn(images: Sequence[Sequence[Band]]) -> list[FloatArray]:
     """Of each band the values that are far more frequent than those beside them."""
-    step = max(sum(bands[0].data.size for bands in images) // _SAMPLES, 1)
+    step = max(sum(bands[0].data.size for bands in images) // SAMPLES, 1)
     found = []
     for number in range(len(images[0])):
         seen = [bands[number].data[bands[number].valid] for bands in images]
-        found.append(_spikes(np.concatenate(seen)[::step]))
+        found.append(drawn_values(np.concatenate(seen)[::step]))
     return found
-
-
-def _spikes(values: Float32Array) -> FloatArray:
-    """Values that occur far more often than those beside them."""
-    value, count = np.unique(values, return_counts=True)
-    if not len(value):
-        return np.empty(0)
-    total = np.concatenate([[0], np.cumsum(count)])
-    index = np.arange(len(value))
-    low, high = np.maximum(index - _BESIDE, 0), np.minimum(index + _BESIDE + 1, len(value))
-    beside = (total[high] - total[low] - count) / np.maximum(high - low - 1, 1)
-    return np.asarray(
-        value[(count >= _LEAST_SHARE * len(values)) & (count > _SPIKE * beside)], dtype=np.float64
-    )
 
 
 def _without(bands: Sequence[Band], drawn: Sequence[FloatArray]) -> list[Band]:
@@ -124,7 +104,7 @@ def _lie_together(refined: Refinement, correction: PixelMap, hidden: Sequence[Ti
     on_both = drawn = 0
     for tile, rest in zip(refined.tiles, hidden, strict=True):
         seen = tile.template[0].valid & ~rest.template[0].valid
-        xy, take = lattice(tile.template[0], part, _SAMPLES)
+        xy, take = lattice(tile.template[0], part, SAMPLES)
         spots = there.forward(xy[seen[take]])
         finer = tile.surface[0]
         to_band = ~finer.grid.transform @ part.surface.grid.transform

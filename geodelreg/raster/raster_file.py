@@ -26,7 +26,8 @@ from geodelreg.raster.fill import undeclared_fill
 from geodelreg.raster.inputs import Opened
 from geodelreg.raster.overviews import Placement, find_placement
 from geodelreg.raster.validity import alpha_bands, bands_with_mask, differs_from_nodata
-from geodelreg.values.raster import BoolArray, Float32Array, Grid, Window
+from geodelreg.values.drawn import drawn_values
+from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, Grid, Window
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -40,6 +41,10 @@ _WHOLE_BLOCK_PIXELS = 4 * _PIECE_PIXELS
 _MOST_THREADS = 4
 _PIECES_PER_THREAD = 4
 """Fewer are read sooner than more handles of the file are opened."""
+
+_LOOKS, _LOOK_PX = 8, 32
+"""Windows along either axis, and their side, that show what is drawn: 65 536 pixels, as many as
+`geodelreg.values.drawn` wants to see."""
 
 _LARGE_BLOCK_BYTES = 64_000_000
 
@@ -67,6 +72,8 @@ class RasterFile:
         Numbers and kinds of the bands that say how good the others are.
     nodata : float or None
         What is no data whatever the file declares; None leaves that to the file.
+    drawn : dict of int to (N,) float64
+        Values of a band, by its number, that are drawn on it and that are no data either.
     hides : callable or None
         Takes a `Grid` that is part of this raster's and gives (H, W) bool, True for the pixels
         that are to be invalid whatever the file says.
@@ -87,6 +94,7 @@ class RasterFile:
             self._alpha = ()
         self.quality_bands = quality_bands(self.path, self.dataset.descriptions)
         self.nodata: float | None = None
+        self.drawn: dict[int, FloatArray] = {}
         self.hides: Callable[[Grid], BoolArray] | None = None
         known = {*self._alpha, *self.quality_bands}
         self.image_bands = tuple(number for number in every if number not in known)
@@ -123,6 +131,23 @@ class RasterFile:
                 return _read(self.dataset, self.image_bands, window)
 
         return undeclared_fill(read, (height, width), self.dataset.dtypes[0])
+
+    def drawn_values(self) -> dict[int, FloatArray]:
+        """Values that are drawn on each image band, by its number; empty unless on all of them."""
+        if self.block_note:
+            return {}
+        height, width = self.grid.shape
+        down, across = min(_LOOK_PX, height), min(_LOOK_PX, width)
+        seen: dict[int, list[Float32Array]] = {number: [] for number in self.image_bands}
+        for row in np.unique(np.linspace(0, height - down, _LOOKS).astype(int)):
+            for column in np.unique(np.linspace(0, width - across, _LOOKS).astype(int)):
+                data, valid = self.read(
+                    self.image_bands, Window(int(column), int(row), across, down)
+                )
+                for plane, number in enumerate(self.image_bands):
+                    seen[number].append(data[plane][valid[plane]])
+        found = {number: drawn_values(np.concatenate(seen[number])) for number in seen}
+        return found if all(map(len, found.values())) else {}
 
     @property
     def block_note(self) -> str:
@@ -268,6 +293,11 @@ class RasterFile:
             return np.zeros(raw.shape, dtype=np.float32), np.zeros(raw.shape, dtype=np.bool_)
         with np.errstate(over="ignore", invalid="ignore"):
             data = raw.astype(np.float32)
+        masks += [
+            (plane, ~np.isin(data[plane], self.drawn[number]))
+            for plane, number in enumerate(numbers)
+            if number in self.drawn
+        ]
         valid = _validity(raw, data, differing, masks)
         if valid is not None:
             data[~valid] = 0

@@ -165,6 +165,23 @@ class RasterReader:
                 )
         return "; ".join(notes)
 
+    def leave_out_drawn(self) -> str:
+        """Take what is drawn on all image bands, as `geodelreg.values.drawn` says, for no data.
+
+        Returns
+        -------
+        str
+            What is left out from now on; empty when nothing is.
+        """
+        found = [file.drawn_values() for file in self._files]
+        if not all(found):
+            return ""
+        for file, drawn in zip(self._files, found, strict=True):
+            file.drawn = drawn
+        every = np.unique(np.concatenate([values for of in found for values in of.values()]))
+        listed = " and ".join(f"{value:g}" for value in every)
+        return f"what is drawn on {self.name} with the value {listed} is left out"
+
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
     ) -> list[Band]:

@@ -200,6 +200,18 @@ def test_a_pattern_of_the_pixel_grid_is_left_out_when_told(tmp_path: Path) -> No
     assert pair.rms_px(told.correction.corrected) < 0.1
 
 
+@pytest.mark.parametrize("kind", ["fixed pattern", "stripes"])
+def test_what_is_drawn_on_both_is_found_left_out_and_told(kind: str, tmp_path: Path) -> None:
+    pair = drawn_on(tmp_path, kind, same_ground=True)
+    found = geodelreg.align(pair.ms, pair.pan)
+    assert pair.rms_px(found.correction.corrected) < 0.1
+    for name in ("ms.tif", "pan.tif"):
+        told = f"what is drawn on {name} with the value 4000 is left out"
+        assert told in found.warnings
+    points = found.tie_points.reference_px[found.tie_points.kept]
+    assert len(points) >= 8
+
+
 def test_ground_that_is_right_beside_labels_is_no_less_so(tmp_path: Path) -> None:
     pair = drawn_on(tmp_path, "labels", same_ground=True)
     assert pair.rms_px(geodelreg.align(pair.ms, pair.pan).correction.corrected) < 0.1
