@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
 
-from geodelreg.align_pair import align_pair
 from geodelreg.alignment import Alignment
 from geodelreg.errors import (
     AlignmentRefusedError,
@@ -35,6 +34,7 @@ from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.raster.reader import RasterReader, check_band, open_raster
 from geodelreg.refit_pair import refit_pair
+from geodelreg.second_look import align_rasters
 from geodelreg.values.result import CheckOutcome, Input, Solution
 from geodelreg.values.timings import Timings
 
@@ -355,27 +355,11 @@ def _check_bands(
 def _solve(
     rasters: _Rasters, options: AlignOptions, progress: Progress | None
 ) -> tuple[Pair, Solution]:
-    """What the images of two open rasters say, if need be without what is drawn on both."""
+    """What the images of two open rasters say."""
     try:
-        found = align_pair(rasters.ms, rasters.pan, options, progress, rasters.timings)
-        told = options.ms_nodata is not None or options.pan_nodata is not None
-        undrawn = None if found[1].verdict.accepted or told else _without_drawn(rasters, options)
-        return undrawn or found
+        return align_rasters(rasters.ms, rasters.pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, rasters.ms, rasters.pan) from error
-
-
-def _without_drawn(rasters: _Rasters, options: AlignOptions) -> tuple[Pair, Solution] | None:
-    """What the ground alone says where labels or stripes are drawn on both; None if not enough."""
-    notes = rasters.ms.leave_out_drawn(), rasters.pan.leave_out_drawn()
-    if not all(notes):
-        return None
-    logger.info("once more: %s", "; ".join(notes))
-    with suppress(NoDataError):
-        pair, solution = align_pair(rasters.ms, rasters.pan, options, None, rasters.timings)
-        if solution.verdict.accepted:
-            return pair, replace(solution, warnings=(*solution.warnings, *notes))
-    return None
 
 
 def _alignment(
