@@ -26,8 +26,10 @@ MAX_MOVE = 1.5
 """A patch that moves further than this, in template pixels, has not converged."""
 _MAX_STEP = 0.05
 """Nor has one whose last step is above this, in template pixels."""
-MIN_VALID = 0.6
+_MIN_VALID = 0.6
 """Least share of usable pixels in a patch."""
+_MIN_VALID_AMONG_STRIPES = 0.3
+"""The same where most patches are hidden in part: 43 pixels of the smallest tell four unknowns."""
 MIN_CORRELATION = 0.5
 """Least absolute correlation after matching."""
 _MAX_SIGMA = 0.5
@@ -140,11 +142,22 @@ def match_patches(
     status = np.zeros(count, dtype=np.uint8)
     status[np.abs(correlation) < MIN_CORRELATION] = Status.CORRELATION
     status[(last > _MAX_STEP) | (np.abs(move).max(axis=1) > MAX_MOVE)] = Status.CONVERGENCE
-    status[~(spread < _MAX_SIGMA) | (share < MIN_VALID)] = Status.TEXTURE
+    status[~(spread < _MAX_SIGMA) | (share < least_valid(share))] = Status.TEXTURE
     linear = local[:, :, :2] * patches.step
     position = local[:, :, 2] + np.einsum("pij,pj->pi", linear, move)
     in_surface = np.einsum("pij,pjk,plk->pil", linear, _finite(covariance), linear)
     return Matched(patches.centre, position, in_surface, correlation, status)
+
+
+def least_valid(share: FloatArray) -> float:
+    """Least share of usable pixels in a patch, given (P,) those of all.
+
+    Clouds and edges hide some patches and leave others whole.  Stripes, labels or dead pixels leave
+    hardly any whole, and what is left of each has to do.
+    """
+    some = share[share > 0]
+    whole = not len(some) or float(np.median(some)) >= _MIN_VALID
+    return _MIN_VALID if whole else _MIN_VALID_AMONG_STRIPES
 
 
 def _curvature(there: PixelMap, patches: Patches) -> FloatArray:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodelreg.fine.least_squares import MIN_CORRELATION, MIN_VALID
+from geodelreg.fine.least_squares import MIN_CORRELATION, least_valid
 from geodelreg.fine.patches import Patches, cut_patches, sample_step
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.fine.texture import noise_of, show_texture
@@ -149,7 +149,8 @@ def _explained(
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
     energy = (image**2).sum(axis=(2, 3))
-    good = seen.mean(axis=2) > MIN_VALID
+    share = seen.mean(axis=2)
+    good = share > least_valid(share[:, 0])
     good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
     return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
 
