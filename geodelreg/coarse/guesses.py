@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +37,14 @@ _AFFINE_MATCHES = 12  # four times what an affine needs; unexplained: ablate
 _CHANCE_LOG_NFA = -2.0
 _TOGETHER_PX = 520_000  # a scale space takes some 230 bytes a pixel
 _FAIR_SHARE = 0.5
+_FINER_LOOKS = 2  # one with bright objects and one without, or the best two
+
+
+class _Look(NamedTuple):
+    """A way to look at MS: which bands, and whether bright objects are left out."""
+
+    bands: str
+    dark: bool
 
 
 def guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:
@@ -55,13 +65,16 @@ def guesses(pair: Pair) -> Iterator[tuple[Pair, Guess]]:
         When a band has no texture where it matters.
     """
     first: tuple[Pair, Overview] | None = None
+    told: dict[_Look, float] = {}
     for seen, images in overviews(pair, scopes(pair)):
+        likely = _likely(told) if images.scope.is_closer else None
+        told.clear()
         if first is None:
             first = seen, images
             proven = None if pair.options.search == "keypoints" else proven_guess(*first)
             if proven is not None:
                 yield seen, proven
-        for guess in keypoint_guesses(seen, images):
+        for guess in _keypoint_guesses(seen, images, told, likely):
             yield seen, guess
     if first is not None:
         yield first[0], edge_guess(*first)
@@ -121,10 +134,28 @@ def _emptiness(pair: Pair, images: Overview) -> NoDataError | None:
     return None
 
 
-def keypoint_guesses(pair: Pair, images: Overview) -> Iterator[Guess]:
+def _likely(told: Mapping[_Look, float]) -> set[_Look]:
+    """The looks to take again, closer: the least by chance with bright objects, and without."""
+    ranked = sorted(told, key=told.__getitem__)
+    dark = [look for look in ranked if look.dark][: _FINER_LOOKS - 1]
+    return {*dark, *[look for look in ranked if not look.dark][: _FINER_LOOKS - len(dark)]}
+
+
+def _keypoint_guesses(
+    pair: Pair, images: Overview, told: dict[_Look, float], likely: set[_Look] | None
+) -> Iterator[Guess]:
     """Maps that SIFT matches agree on, one per way to look at the MS bands.
 
     Stops after the first way that is beyond doubt; a weak one is followed by those of other bands.
+
+    Parameters
+    ----------
+    pair : Pair
+    images : Overview
+    told : dict of _Look to float
+        Takes the log NFA of each look.
+    likely : set of _Look, optional
+        Which to take; all where None.
     """
     found: list[Guess] = []
     bright = bright_mask(images.reference)
@@ -132,17 +163,20 @@ def keypoint_guesses(pair: Pair, images: Overview) -> Iterator[Guess]:
     dark: Keypoints | None = None
     working_px = working_gsd_m(pair, images.scope) / np.array(pair.source_gsd_m)
     for band in band_looks(images.source):
-        source, reference = _detect_both(pair, images.scope, band, images.reference, reference)
-        everywhere = _match(pair, images, source, reference)
+        all_of_it, without = _Look(band.name, False), _Look(band.name, True)
+        everywhere = ground = None
+        if likely is None or all_of_it in likely:
+            source, reference = _detect_both(pair, images.scope, band, images.reference, reference)
+            told[all_of_it], everywhere = _match(pair, images, source, reference)
         mine = None if bright is None else bright_mask(band)
         if mine is None or bright is None:
             agreed = [] if everywhere is None else [everywhere]
         else:
-            ground = None
-            if everywhere is None or not is_calm_guess(everywhere):
+            calm = everywhere is not None and is_calm_guess(everywhere)
+            if not calm and (likely is None or without in likely):
                 hidden, scene = _hidden(band, mine), _hidden(images.reference, bright)
                 source, dark = _detect_both(pair, images.scope, hidden, scene, dark)
-                ground = _match(pair, images, source, dark)
+                told[without], ground = _match(pair, images, source, dark)
             doubt = in_doubt(ground, everywhere, working_px)
             agreed = [replace(guess, bright=(mine, bright)) for guess in doubt]
         if any(guess.log_nfa < SURE_LOG_NFA for guess in agreed):
@@ -193,10 +227,12 @@ def _detect(band: Band, flip: bool, pair: Pair, scope: Scope) -> Keypoints:
     return detect(np.ascontiguousarray(image[::-1]), np.ascontiguousarray(valid[::-1]), options)
 
 
-def _match(pair: Pair, images: Overview, source: Keypoints, reference: Keypoints) -> Guess | None:
-    """What the keypoints of one look say, if they say anything."""
+def _match(
+    pair: Pair, images: Overview, source: Keypoints, reference: Keypoints
+) -> tuple[float, Guess | None]:
+    """What the keypoints of one look say, if they say anything, and its log NFA."""
     if min(len(source), len(reference)) < _FEWEST_MATCHES:
-        return None
+        return math.inf, None
     nearest = match_descriptors(source, reference)
     passed = nearest.take(ratio_test(nearest.ratio, pair.options.ratio))
     matches = passed.take(one_to_one(*passed.xy(source, reference), passed.ratio))
@@ -215,34 +251,35 @@ def _agree(
     keypoints: tuple[Keypoints, Keypoints],
     matches: Matches,
     counts: dict[str, int],
-) -> Guess | None:
-    """The correction that most matches agree on, unless chance would do as well."""
+) -> tuple[float, Guess | None]:
+    """The log NFA of the correction that most matches agree on, and that unless it is chance."""
     if len(matches) < _FEWEST_MATCHES:
-        return None
+        return math.inf, None
     seed = pair.options.seed
     similar = consensus_keypoints(*keypoints, matches, _THRESHOLD_PX, seed=seed, kind="similarity")
     source_xy, reference_xy = matches.xy(*keypoints)
     if similar.map is None:
-        return None
+        return math.inf, None
     loose = radial_residuals(similar.map, source_xy, reference_xy) <= _LOOSE_PX
     mesh = filter_matches(source_xy, reference_xy, Consensus(similar.map, loose))
     inliers = mesh == Status.KEPT
     counts = counts | {"consensus": int(loose.sum()), "Delaunay mesh": int(inliers.sum())}
     if inliers.sum() < _FEWEST_MATCHES:
-        return None
+        return math.inf, None
     kind = "affine" if inliers.sum() >= _AFFINE_MATCHES else "similarity"
     there = fit_plainly(source_xy[inliers], reference_xy[inliers], kind)
     residual = radial_residuals(there, source_xy, reference_xy)
     surprise, _ = log_nfa(residual, float(images.reference.data.size), 2, _LOOSE_PX)
     logger.debug("%s: %s, log NFA %.1f", images.scope.name, counts, surprise)
     if surprise > _CHANCE_LOG_NFA:
-        return None
+        return surprise, None
     to_source = _to_full(images.source[0], pair.source.grid, _mirrored(pair))
     to_reference = _to_full(images.reference, pair.reference.grid, False)
     source_px = to_source.forward(source_xy[inliers])
     header_px = pair.header.inverse(to_reference.forward(reference_xy[inliers]))
     correction = fit_plainly(source_px, header_px, kind)
-    return Guess(correction, surprise, counts, images, source_px, header_px, len(matches))
+    guess = Guess(correction, surprise, counts, images, source_px, header_px, len(matches))
+    return surprise, guess
 
 
 def _to_full(band: Band, full: Grid, flipped: bool) -> AffineMap:

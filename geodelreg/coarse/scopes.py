@@ -30,7 +30,7 @@ def scopes(pair: Pair) -> Iterator[Scope]:
         first = Scope(*windows, _FIRST_BUDGET_PX, few, "header overlap")
         yield first
         if working_gsd_m(pair, first) > _FINER * max(*pair.source_gsd_m, *pair.reference_gsd_m):
-            yield Scope(*windows, SECOND_BUDGET_PX, most, "header overlap, finer")
+            yield Scope(*windows, SECOND_BUDGET_PX, most, "header overlap, finer", is_closer=True)
     if windows != whole:
         name = "both rasters whole"
         yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, most, name, is_whole=True)

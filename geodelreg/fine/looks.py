@@ -41,7 +41,8 @@ def band_looks(bands: list[Band]) -> Iterator[Band]:
     yield mean_band(bands[:_VISIBLE_BANDS])
     if len(bands) > _VISIBLE_BANDS:
         yield bands[_VISIBLE_BANDS]
-        yield mean_band(bands[_VISIBLE_BANDS:])
+        if len(bands) > _VISIBLE_BANDS + 1:
+            yield mean_band(bands[_VISIBLE_BANDS:])
         yield bands[2]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from geodelreg.fine.tiles import (
     plan_tiles,
     read_tiles,
 )
+from geodelreg.fine.tone import SyntheticPan
 from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_sigma, fit_tone
 from geodelreg.fit.estimate import Estimate
 from geodelreg.geo.maps.affine import IDENTITY
@@ -252,10 +254,17 @@ def _passes(
     passes = _PASSES_FROM_AFAR if or_header else _PASSES
     best: Refinement | None = None
     others = looks[1:]
+
+    @cache  # whatever the look
+    def first_tone(all_of_them: bool, from_header: bool) -> SyntheticPan:
+        start, where = starts[from_header], tiles if all_of_them else some
+        return fit_tone(part, where, start, DEFAULT_SIGMA, _FEWER_SAMPLES)
+
     tries = [(look, where) for look in looks[:2] for where in (some, tiles)]
     for look, where in tries if some is not tiles else tries[1::2]:
         for start in starts:
-            found = _approach(part, where, start, options, look, passes)
+            tone = first_tone(where is tiles, start is not near)
+            found = _approach(part, where, start, options, look, passes, tone)
             if found is None:
                 continue
             if best is None or preference(found.last) < preference(best.last):
@@ -300,13 +309,20 @@ def _smaller(found: Pass, size: int) -> int:
 
 
 def _approach(
-    part: Roles, tiles: list[Tile], near: PixelMap, options: MatchOptions, look: Look, passes: int
+    part: Roles,
+    tiles: list[Tile],
+    near: PixelMap,
+    options: MatchOptions,
+    look: Look,
+    passes: int,
+    tone: SyntheticPan,
 ) -> Refinement | None:
-    """Passes towards the map and the point spread, from a start a few pixels off."""
+    """Passes towards the map and the point spread, from a start a few pixels off, and its tone."""
     local = look.local_tone and part.ms_is_template
     sigma, found, few = DEFAULT_SIGMA, None, None
     for number in range(passes):
-        tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES, few)
+        if number:
+            tone = fit_tone(part, tiles, near, sigma, _FEWER_SAMPLES, few)
         tuning = Tuning(sigma, tone, look.high_pass, local)
         if found is not None and number == 1 and not local:  # without a common tone no sharpness
             agreed = found.matched.template_px[found.status == Status.KEPT]

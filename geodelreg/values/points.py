@@ -217,6 +217,8 @@ class Scope:
     name : str
     is_whole : bool
         Both rasters are looked at from edge to edge, whatever their headers say.
+    is_closer : bool
+        The scope before it looked at the same parts, decimated further.
     """
 
     source: Window
@@ -225,6 +227,7 @@ class Scope:
     keypoints: int
     name: str
     is_whole: bool = False
+    is_closer: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
