@@ -143,7 +143,7 @@ def masked_correlation(
     def spectrum(image: Float32Array) -> Float32Array:
         padded = np.zeros(shape, dtype=np.float32)
         padded[:height, :width] = image
-        return np.asarray(cv2.dft(padded, nonzeroRows=height))
+        return np.asarray(cv2.dft(padded))
 
     def correlate(a: Float32Array, b: Float32Array) -> Float32Array:
         product = cv2.mulSpectrums(a, b, 0, conjB=True)

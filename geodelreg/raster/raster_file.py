@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -191,7 +191,8 @@ class RasterFile:
         """Pixels of a window, averaged down to `shape` from an overview or from the full raster.
 
         Only a piece for each thread is in memory at a time; whatever their number, the same sums
-        are added in the same order.  Parameters and returned values as in `read`.
+        are added in the same order.  A small raster stays in GDAL's cache, for its windows are
+        read next.  Parameters and returned values as in `read`.
         """
         if overview is None:
             dataset, placement = self.dataset, Placement((1.0, 1.0))
@@ -200,7 +201,10 @@ class RasterFile:
         origin, size = placement.area(window)
         average = BoxAverage(len(numbers), shape, origin, size)
         pieces = _pieces(dataset, origin, size, len(numbers))
-        levels = self._handles(len(pieces)) if overview is None else [dataset]
+        samples = dataset.width * dataset.height * len(numbers)
+        small = samples * np.dtype(dataset.dtypes[numbers[0] - 1]).itemsize <= PIECES_BYTES
+        alone = small or overview is not None
+        levels = [dataset] if alone else self._handles(len(pieces))
 
         def share(piece: Window) -> Share:
             level = free.get()
@@ -213,7 +217,8 @@ class RasterFile:
         free: SimpleQueue[DatasetReader] = SimpleQueue()
         for level in levels:
             free.put(level)
-        with passing_through(PIECES_BYTES), ThreadPoolExecutor(len(levels)) as pool:
+        passing = nullcontext() if small else passing_through(PIECES_BYTES)
+        with passing, ThreadPoolExecutor(len(levels)) as pool:
             for start in range(0, len(pieces), 2 * len(levels)):
                 for one in pool.map(share, pieces[start : start + 2 * len(levels)]):
                     average.take(one)
