@@ -99,10 +99,12 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
 
 def plain(value: Any) -> Any:
     """Value made of JSON types alone; numbers that are not finite become None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+    if type(value) is float:  # nearly all that a report holds
+        return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
@@ -203,17 +205,12 @@ def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
         "by_status": {status.name.lower(): counts[status] for status in Status},
     }
     if listed:
+        names = "source_px", "reference_px", "covariance_px2", "score", "residual_px"
+        each = zip(*(getattr(points, name).tolist() for name in names), strict=True)
         report["points"] = [
-            {
-                "source_px": points.source_px[index],
-                "reference_px": points.reference_px[index],
-                "covariance_px2": points.covariance_px2[index],
-                "score": points.score[index],
-                "status": Status(points.status[index]).name.lower(),
-                "is_check": False,
-                "residual_px": points.residual_px[index],
-            }
-            for index in range(len(points))
+            {"status": Status(status).name.lower(), "is_check": False}
+            | dict(zip(names, values, strict=True))
+            for status, values in zip(points.status.tolist(), each, strict=True)
         ]
     return report
 

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import apply_affine
@@ -30,7 +28,7 @@ from geodelreg.product.gcps.context import (
 )
 from geodelreg.product.gcps.facts import band_of, facts_of, of_bands
 from geodelreg.values.points import Gcp, TiePoints
-from geodelreg.values.raster import Grid
+from geodelreg.values.raster import Grid, IntArray
 from geodelreg.values.result import Alignment
 
 __all__ = [
@@ -128,14 +126,14 @@ def gcps_from_alignment(
             row,
             x,
             y,
-            info=_info(points, int(index)),
-            enabled=bool(points.kept[index]),
+            info=info,
+            enabled=enabled,
             facts=facts,
         )
-        for number, (index, (column, row), (x, y), facts) in enumerate(
+        for number, ((column, row), (x, y), info, enabled, facts) in enumerate(
             zip(
-                order, points.source_px[order].tolist(), ground.tolist(),
-                facts_of(alignment, order), strict=True,
+                points.source_px[order].tolist(), ground.tolist(), _infos(points, order),
+                points.kept[order].tolist(), facts_of(alignment, order), strict=True,
             ),
             start=1,
         )
@@ -143,16 +141,15 @@ def gcps_from_alignment(
     return (*common, *of_bands(alignment, common)) if bands else common
 
 
-def _info(points: TiePoints, index: int) -> str:
-    """Residual and standard deviation, in PAN pixels, as far as they are known."""
-    texts = []
-    for name, (x, y) in (
-        ("residual", points.residual_px[index]),
-        ("sigma", points.sigma_px[index]),
-    ):
-        if np.isfinite(x) and np.isfinite(y):
-            texts.append(f"{name} {x:.4f} {y:.4f} px")
-    return "; ".join(texts)
+def _infos(points: TiePoints, order: IntArray) -> Iterator[str]:
+    """Residual and standard deviation of each, in PAN pixels, as far as they are known."""
+    named = ("residual", points.residual_px[order]), ("sigma", points.sigma_px[order])
+    for each in zip(*(values.tolist() for _, values in named), strict=True):
+        yield "; ".join(
+            f"{name} {x:.4f} {y:.4f} px"
+            for (name, _), (x, y) in zip(named, each, strict=True)
+            if math.isfinite(x) and math.isfinite(y)
+        )
 
 
 def write_gcps(
