@@ -142,8 +142,8 @@ def align_pair(
         heard.append(Claim(guess.map, guess.log_nfa))
         looked = (1.0 + looked) / 2
     refused.sort(key=lambda one: one.passed, reverse=True)
-    if may_bend(options):
-        for one in refused[:_BENT_TRIES]:
+    if pair.may_bend:
+        for one in [one for one in refused if one.solution.model not in FOLLOWING][:_BENT_TRIES]:
             solution = conclude(one.pair, one.found, one.heard, bent=True)
             if solution.verdict.accepted:
                 report(1.0, "done")
@@ -241,19 +241,20 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     notes: tuple[str, ...] = ()
     clouds = 0.0
     with pair.timings("evidence"):
-        accuracy, evidence = gather(guess, refined, fitted, heard)
-        if bent or passes(judge(evidence, options)):
-            whole = look_at_whole(guess, refined, fitted.map)
-            everyone = hear_everyone(pair, found, whole)
-            closer = whole if everyone is None else whole.under(pair, everyone.map)
+        # what will be followed is judged once, when it has been
+        seen = see_whole(pair, found) if pair.may_bend else None
+        follows = seen is not None and seen.must_follow(pair, bent)
+        if not follows:
+            accuracy, evidence = gather(guess, refined, fitted, heard)
+        if follows or bent or passes(judge(evidence, options)):
+            whole, everyone, closer = seen or see_whole(pair, found)
             clouds = whole.clouds
-            may_follow = may_bend(options) and clouds <= LEAST_SHARE
-            follows = may_follow and (bent or options.model in FOLLOWING or closer.is_bent(options))
             if everyone is not None and not follows:
                 again = gather(guess, refined, everyone, heard)
                 if passes(judge(again[1], options)):
                     fitted, (accuracy, evidence), whole = everyone, again, closer
-            if follows or (may_follow and whole.is_bent(options)):
+            follows = follows or (may_follow(pair, whole) and whole.is_bent(options))
+            if follows:
                 refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
                 accuracy, evidence = gather(guess, refined, fitted, heard)
                 whole = whole.followed(pair, fitted)
@@ -290,6 +291,36 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     )
 
 
+class Seen(NamedTuple):
+    """What all patches say about a map.
+
+    Attributes
+    ----------
+    whole : Whole
+    everyone : Fitted or None
+        The fit to all of the ground, where it is bent; None where those that agree spoke for it.
+    closer : Whole
+        Under that.
+    """
+
+    whole: Whole
+    everyone: Fitted | None
+    closer: Whole
+
+    def must_follow(self, pair: Pair, bent: bool) -> bool:
+        """True when no affine will do, or none was asked for."""
+        options = pair.options
+        asked = bent or options.model in FOLLOWING or self.closer.is_bent(options)
+        return asked and may_follow(pair, self.whole)
+
+
+def see_whole(pair: Pair, found: Found) -> Seen:
+    """Ask all patches about a map, and where they say that it bends, fit one to them."""
+    whole = look_at_whole(found.guess, found.refined, found.fitted.map)
+    everyone = hear_everyone(pair, found, whole)
+    return Seen(whole, everyone, whole if everyone is None else whole.under(pair, everyone.map))
+
+
 def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
     """The fit to all of the ground, where it is bent; None where those that agree spoke for it."""
     asked = pair.options
@@ -299,10 +330,9 @@ def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
     return fit_patches(pair, found.guess, found.refined, status)
 
 
-def may_bend(options: AlignOptions) -> bool:
-    """True when a field was asked for, or may be written where one affine is not enough."""
-    asked = options.model in FOLLOWING or (options.model == "auto" and options.on_local == "field")
-    return asked and options.method == "delaunay"
+def may_follow(pair: Pair, whole: Whole) -> bool:
+    """True when a field may be written, and clouds leave it enough of the ground."""
+    return pair.may_bend and whole.clouds <= LEAST_SHARE
 
 
 def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:

@@ -12,7 +12,7 @@ from geodelreg.errors import CrsTransformError, UnsupportedGeoreferenceError
 from geodelreg.geo.grid import corners_of, gsd_px_m, outline, window_around
 from geodelreg.geo.maps.header import HeaderMap, header_map
 from geodelreg.geo.maps.smooth import Inverse
-from geodelreg.options import AlignOptions
+from geodelreg.options import FOLLOWING, AlignOptions
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Window, WindowReader
 from geodelreg.values.timings import Timings
@@ -89,6 +89,13 @@ class Pair:
     def threads(self) -> int:
         """Threads to use."""
         return self.options.threads or os.cpu_count() or 1
+
+    @property
+    def may_bend(self) -> bool:
+        """True when a field was asked for, or may be written where one affine is not enough."""
+        model, on_local = self.options.model, self.options.on_local
+        asked = model in FOLLOWING or (model == "auto" and on_local == "field")
+        return asked and self.options.method == "delaunay"
 
     @property
     def source_centre(self) -> FloatArray:

@@ -14,7 +14,7 @@ from geodelreg.fine.snap import snap_points
 from geodelreg.fit.choice import Selection, select_for
 from geodelreg.fit.estimate import Observations, minimum_points
 from geodelreg.fit.field import FEWEST_POINTS, facets_of, fit_field, selection_of
-from geodelreg.fit.jumps import find_jumps
+from geodelreg.fit.jumps import cut_at_jumps
 from geodelreg.fit.models import Frame, design
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.tin import TinMap
@@ -182,10 +182,7 @@ def _fit(pair: Pair, given: GivenPoints, points: Observations, used: BoolArray) 
     """The model asked for; only what it determines is left of the points used."""
     selection = select_for(pair, points)
     if pair.options.model == "field":
-        fit = fit_field(points)
-        jumps = find_jumps(points.take(fit.inlier), fit.field.kernel, fit.weight)
-        if jumps:
-            fit = fit_field(points, fit.field.kernel, jumps)
+        fit = cut_at_jumps(points, fit_field(points))
         selection = selection_of(fit.field, fit.distance2[fit.inlier], Frame.of(pair))
         inlier = fit.inlier
     elif pair.options.model == "tin":

@@ -19,7 +19,7 @@ from geodelreg.fit.delaunay_mesh import star_filter
 from geodelreg.fit.estimate import Estimate, Observations, minimum_points, robust_fit
 from geodelreg.fit.models import Frame
 from geodelreg.fit.rigid_core import rigid_core
-from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.pair import LATTICE, Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Status, TiePoints
@@ -43,8 +43,8 @@ _CONTRADICTION_PX = 1.5  # of the overview; unexplained: ablate
 
 _MIXED_SIGMA = 0.03  # of a patch pixel; unexplained: ablate
 
-_CALM_PATCHES = 0.9  # unexplained: ablate
-_CALM_SIGMA_PX = 0.02  # unexplained: ablate
+CALM_PATCHES = 0.9  # unexplained: ablate
+CALM_SIGMA_PX = 0.02  # unexplained: ablate
 _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 _CONTRADICTION_SIGMAS = 4.0
 _CONTRADICTION_FLOOR_PX = 0.05  # of MS; unexplained: ablate
@@ -160,7 +160,7 @@ class Pass:
             return False
         textured = self.status != Status.TEXTURE
         share = float((self.status[textured] == Status.KEPT).mean()) if textured.any() else 0.0
-        return share > _CALM_PATCHES and self.scatter_px < _CALM_SIGMA_PX
+        return share > CALM_PATCHES and self.scatter_px < CALM_SIGMA_PX
 
 
 def agreement(
@@ -169,7 +169,8 @@ def agreement(
     """Robust fit of an affine to the patches that agree; where they are few, of a shift.
 
     A robust mean of two motions is neither: where the patches scatter beyond their own
-    covariances, the motion that many of them share to within their noise is found first.
+    covariances, the motion that many of them share to within their noise is found first.  Of a
+    start that bends, what is left of it is fitted.
 
     Parameters
     ----------
@@ -183,6 +184,10 @@ def agreement(
     """
     status = status.copy()
     kept = np.flatnonzero(status == Status.KEPT)
+    if start.as_affine() is None:
+        left = replace(points, source=start.forward(points.source))
+        status, estimate = agreement(left, status, IDENTITY, frame, unit)
+        return status, estimate and replace(estimate, map=start.then(estimate.map))
     estimate = _fit_all(points.take(kept), start, frame)
     if estimate is not None and _is_mixed(estimate, unit):
         inliers = rigid_core(points.take(kept), unit)
@@ -258,7 +263,7 @@ def nothing_moves(everything: Pass, unit: float) -> bool:
         return False
     matched = np.isin(everything.status, (Status.KEPT, *ELSEWHERE))
     textured = int((everything.status != Status.TEXTURE).sum())
-    if not matched.sum() > _CALM_PATCHES * textured:
+    if not matched.sum() > CALM_PATCHES * textured:
         return False
     points = everything.points.take(np.flatnonzero(matched))
     gap = np.hypot(*(everything.estimate.map.forward(points.source) - points.target).T)

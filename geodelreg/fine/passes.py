@@ -8,7 +8,16 @@ from functools import cache
 
 import numpy as np
 
-from geodelreg.fine.layers import Pass, ground_alone, is_telling, nothing_moves, same_place
+from geodelreg.fine.layers import (
+    CALM_PATCHES,
+    CALM_SIGMA_PX,
+    ELSEWHERE,
+    Pass,
+    ground_alone,
+    is_telling,
+    nothing_moves,
+    same_place,
+)
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.looks import HAZE, PLAIN, SHARPER, Look, preference, sharpest
 from geodelreg.fine.matching import match_pass
@@ -24,7 +33,10 @@ from geodelreg.fine.tiles import (
 from geodelreg.fine.tone import SyntheticPan
 from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_sigma, fit_tone
 from geodelreg.fit.estimate import Estimate
+from geodelreg.fit.field import FEWEST_POINTS, FieldFit, fit_field, spacing
+from geodelreg.fit.jumps import cut_at_jumps
 from geodelreg.geo.maps.affine import IDENTITY
+from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.pair import Roles, overlap_in_template
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Overview, Status
@@ -46,6 +58,8 @@ _MUCH_VISIBLE = 0.75  # unexplained: ablate
 _MINORITY = 0.4
 """Share of the patches that agree, below which the others may have spoilt the tone: a robust fit
 breaks down at half, and patches at the edge of what shows something hold some of the rest."""
+_GENTLE = 4.0
+"""Patches within which a field varies: waves 7.5 patches long give 4.3, banks of clouds below 2."""
 _BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.tuning` that is not usual
 
 
@@ -67,6 +81,8 @@ class Refinement:
         The tiles show no bright objects.
     without_bright : bool
         Bright objects were left out, because with them the patches agree on something else.
+    bend : Kernel or None
+        Of the field on which nearly all patches agree, where that was asked.
     """
 
     part: Roles
@@ -76,6 +92,7 @@ class Refinement:
     size: int
     dark_only: bool = False
     without_bright: bool = False
+    bend: Kernel | None = None
 
     @property
     def estimate(self) -> Estimate:
@@ -205,6 +222,8 @@ def _of_the_ground(
     everything = _passes(part, tiles, near, size, (PLAIN, *SHARPER))
     if guess.bright is None:
         return everything
+    if everything is not None and (kernel := _calm_bend(everything)) is not None:
+        return replace(everything, bend=kernel)
     unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
     if everything is not None and (
         everything.is_blurred or everything.last.is_calm or nothing_moves(everything.last, unit)
@@ -223,6 +242,34 @@ def _of_the_ground(
     if not same_place(pair, ground.last, everything.last):
         return replace(ground, without_bright=True)
     return ground if ground_alone(pair, ground.last, everything.last) else everything
+
+
+def _calm_bend(found: Refinement) -> Kernel | None:
+    """How a field varies on which nearly all textured patches agree to within their own noise.
+
+    Clouds have edges that are no rows: a field that follows them bends from patch to patch, or
+    leaves them out.
+    """
+    last = found.last
+    matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
+    most = CALM_PATCHES * (last.status != Status.TEXTURE).sum()
+    if not found.part.pair.may_bend or len(matched) <= max(most, FEWEST_POINTS):
+        return None
+    points = last.points.take(matched)
+    if not np.ptp(points.source, axis=0).min() > 0:
+        return None
+    fit = fit_field(points)
+    if not _is_calm(fit, spacing(points)):
+        fit = cut_at_jumps(points, fit)
+    return fit.field.kernel if _is_calm(fit, spacing(points)) else None
+
+
+def _is_calm(fit: FieldFit, spacing_px: float) -> bool:
+    """True when points agree to within their noise on a field that bends gently, or is cut."""
+    kernel, calm = fit.field.kernel, CALM_SIGMA_PX**2
+    agree = fit.inlier.mean() > CALM_PATCHES and kernel.nugget_px2 < calm
+    bends = max(kernel.variance_px2) > calm and kernel.range_px > _GENTLE * spacing_px
+    return bool(agree and (bends or fit.field.jumps))
 
 
 def _is_near_header(part: Roles, correction: PixelMap) -> bool:

@@ -19,7 +19,7 @@ from geodelreg.fine.tiles import SMALLEST_PATCH_PX, patch_size, plan_tiles, read
 from geodelreg.fine.tuning import fit_sigma, fit_tone
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import FEWEST_POINTS, FieldFit, fit_field
-from geodelreg.fit.jumps import find_jumps
+from geodelreg.fit.jumps import cut_at_jumps
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.pair import overlap_in_template
 from geodelreg.values.maps import PixelMap
@@ -77,7 +77,7 @@ class Settled:
 
 
 def settle(refined: Refinement, start: PixelMap) -> Settled | None:
-    """Match and fit in turn until the field moves by less than it is uncertain.
+    """Match and fit in turn until the next pass would move the field by less than it is uncertain.
 
     Smaller patches are tried where the field bends within few of them.
 
@@ -123,9 +123,8 @@ def _everywhere(refined: Refinement, start: PixelMap) -> Refinement:
 
 def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
     part, tiles, tuning = refined.part, refined.tiles, refined.tuning
-    current, settled = start, None
+    current, settled, moved = start, None, 0.0
     kernel = start.kernel if isinstance(start, FieldMap) else None
-    jumps: tuple[float, ...] = ()
     options = MatchOptions(size, _ITERATIONS, _TOLERANCE, bent=True)
     some_tiles = tiles[:: 1 + len(tiles) // _TONE_TILES]
     for number in range(1, _MOST_PASSES + 1):
@@ -146,16 +145,17 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
         some = points.take(ground)
         if len(some) < FEWEST_POINTS or not np.ptp(some.source, axis=0).min() > 0:
             return settled
-        fit = fit_field(some, kernel, jumps)
         if settled is None:
-            jumps = find_jumps(some.take(fit.inlier), fit.field.kernel, fit.weight)
-            if jumps:
-                fit = fit_field(some, kernel, jumps)
+            fit = cut_at_jumps(some, fit_field(some, kernel))
+        else:
+            fit = fit_field(some, kernel, settled.fit.field.jumps)
         there = replace(refined, tuning=tuning, size=size)
         settled = Settled(fit, matched, points, ground, there, number)
-        moved = _rms(fit.field.forward(some.source) - current.forward(some.source))
+        before, moved = moved, _rms(fit.field.forward(some.source) - current.forward(some.source))
         current, kernel = fit.field, fit.field.kernel
-        if moved < _STANDS_STILL * _sigma(settled):
+        # what is left shrinks from pass to pass as it did before the last one
+        shrinks = min(moved / before, 1.0) if number > 1 else 1.0
+        if moved * shrinks < _STANDS_STILL * _sigma(settled):
             break
         options = replace(options, iterations=_LATER_ITERATIONS)
     return settled

@@ -161,8 +161,8 @@ def tuned(
         return total, slope
 
     most = (MOST_STRAIN * extent) ** 2
-    low = np.log([_spacing(points), *3 * [_LEAST_VARIANCE_PX2]])
-    high = np.log([max(extent, 2 * _spacing(points)), most, most, most])
+    low = np.log([spacing(points), *3 * [_LEAST_VARIANCE_PX2]])
+    high = np.log([max(extent, 2 * spacing(points)), most, most, most])
     start = np.log([kernel.range_px, *kernel.variance_px2, kernel.nugget_px2])
     found = minimize(
         cost, np.clip(start, low, high), jac=True,
@@ -173,18 +173,19 @@ def tuned(
 
 
 def _first_guess(points: Observations) -> Kernel:
-    spacing = _spacing(points)
+    spacing_px = spacing(points)
     move = points.target - points.source
     columns = np.column_stack([points.source, np.ones(len(points))])
     left = move - columns @ np.linalg.lstsq(columns, move, rcond=None)[0]
     variance = np.maximum(left.var(axis=0), _LEAST_VARIANCE_PX2)
     noise = float(np.median(points.covariance.trace(axis1=1, axis2=2))) / 2
     return Kernel(
-        4 * spacing, (float(variance[0]), float(variance[1])), max(noise, _LEAST_NUGGET_PX2)
+        4 * spacing_px, (float(variance[0]), float(variance[1])), max(noise, _LEAST_NUGGET_PX2)
     )
 
 
-def _spacing(points: Observations) -> float:
+def spacing(points: Observations) -> float:
+    """Mean distance of neighbours, source pixels, if the points fill their extent."""
     extent = np.ptp(points.source, axis=0)
     return float(np.sqrt(extent[0] * extent[1] / len(points)))
 

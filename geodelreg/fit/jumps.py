@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.field import tuned
+from geodelreg.fit.field import FieldFit, fit_field, tuned
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.values.raster import FloatArray, IntArray
@@ -23,6 +23,19 @@ _CANDIDATES = 3
 _SIDE_ROWS = 3
 _LEAST_PER_PART = 6
 """Points, for the offset of a part and its noise."""
+
+
+def cut_at_jumps(points: Observations, smooth: FieldFit) -> FieldFit:
+    """The fit to the same points with cuts where the images jump along rows; itself where not.
+
+    Parameters
+    ----------
+    points : Observations
+    smooth : FieldFit
+        Of all of them, without cuts.
+    """
+    jumps = find_jumps(points.take(smooth.inlier), smooth.field.kernel, smooth.weight)
+    return fit_field(points, smooth.field.kernel, jumps) if jumps else smooth
 
 
 def find_jumps(points: Observations, kernel: Kernel, weight: FloatArray) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from geodelreg.fine.clouds import HeightParallax, height_parallax
 from geodelreg.fine.ground import Ground, find_ground, other_motions
 from geodelreg.fine.layers import ELSEWHERE
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
-from geodelreg.fine.matching import match_pass, observe
+from geodelreg.fine.matching import match_tiles, observe
 from geodelreg.fine.motions import layers
 from geodelreg.fine.overlay import overlay
 from geodelreg.fine.passes import Refinement
@@ -229,31 +229,28 @@ def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
     if count < 2:
         return None
     options = MatchOptions(size=refined.size)
-    first, second = (
-        match_pass(
-            part,
-            refined.tiles,
-            correction,
-            replace(refined.tuning, tone=single_band(count, band), local_tone=False),
-            options,
-        )
-        for band in (0, min(count, _VISIBLE) - 1)
-    )
-    move, one, other = (
-        np.where(
-            np.isin(p.status, (Status.KEPT, *ELSEWHERE))[:, None],
-            p.points.target - correction.forward(p.points.source),
-            np.nan,
-        )
-        for p in (last, first, second)
-    )
-    difference = one - other
+
+    def alone(band: int) -> tuple[FloatArray, Observations]:
+        tuning = replace(refined.tuning, tone=single_band(count, band), local_tone=False)
+        matched = match_tiles(part, refined.tiles, correction, tuning, options)
+        points = observe(part, matched, correction)
+        return _moves(matched.status, points, correction), points
+
+    (one, first), (other, second) = alone(0), alone(min(count, _VISIBLE) - 1)
+    move, difference = _moves(last.status, last.points, correction), one - other
     known = np.isfinite(difference).all(axis=1)
     if not known.any():
         return None
     difference -= np.median(difference[known], axis=0)
-    variance = first.points.covariance + second.points.covariance
+    variance = first.covariance + second.covariance
     return height_parallax(move, difference, np.sqrt(variance.trace(axis1=1, axis2=2)))
+
+
+def _moves(status: StatusArray, points: Observations, correction: PixelMap) -> FloatArray:
+    """(P, 2) of patches that matched, MS pixels; NaN of the others."""
+    matched = np.isin(status, (Status.KEPT, *ELSEWHERE))
+    matched &= np.isfinite(points.covariance).all(axis=(1, 2))
+    return np.where(matched[:, None], points.target - correction.forward(points.source), np.nan)
 
 
 def _placed(places: Places) -> BoolArray:
@@ -303,7 +300,7 @@ def _bent(
     some = np.flatnonzero(member)[:: 1 + int(member.sum()) // _MOST_POINTS]
     if len(some) < FEWEST_POINTS or not np.ptp(points.source[some], axis=0).min() > 0:
         return agreed
-    field = fit_field(points.take(some)).field
+    field = fit_field(points.take(some), refined.bend).field
     ground = np.zeros(len(last.status), dtype=np.bool_)
     ground[matched] = member[: len(matched)]
     return Whole(_left(pair, field, correction), ground, field=field)

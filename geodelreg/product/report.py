@@ -99,16 +99,14 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
 
 def plain(value: Any) -> Any:
     """Value made of JSON types alone; numbers that are not finite become None."""
-    if type(value) is float:  # nearly all that a report holds
-        return value if math.isfinite(value) else None
+    if isinstance(value, float):  # first: fields have thousands
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
     return value
 
 

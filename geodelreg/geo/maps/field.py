@@ -19,7 +19,7 @@ from geodelreg.geo.maps.smooth import SmoothMap, point_rows, points_of_rows, sol
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, IntArray
 
-_AT_ONCE = 500_000  # distances: they stay in the cache
+_AT_ONCE = 50_000  # distances: all that is made of them stays in the cache
 _INVERSE_STEPS = 30  # each shrinks an error at least to the strain's share
 
 

@@ -88,7 +88,9 @@ class Axis:
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Leave-one-out residuals and their variances."""
-        half = _lower(self.factor, np.eye(len(self.alpha)))
+        from scipy.linalg.lapack import dtrtri
+
+        half, _ = dtrtri(self.factor, lower=1)
         trend = _lower(self.normal, self.design.T @ half)
         precision = (half**2).sum(axis=0) - (trend**2).sum(axis=0)
         return self.alpha / precision, 1.0 / precision
