@@ -23,6 +23,8 @@ COMMANDS = {
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
+    "peers-real": ("benchmarks.peers.real", "the same on real pairs, measured independently"),
+    "peers-local": ("benchmarks.peers.local", "the same on pairs that bend"),
     "speed": ("benchmarks.peers.speed", "wall time beside a half-size SIFT script, in turn"),
     "stages": ("benchmarks.peers.stages", "where the time of one alignment goes"),
     "compare": ("benchmarks.peers.table", "two result files of `peers` as ratios"),

@@ -114,6 +114,7 @@ def run_case(case: Case, pair: BentPair) -> Row:
         "model": found["correction"]["model"],
         "best_affine_px": _rms(pair.errors(pair.best_affine())),
         "seconds": usage.wall_s,
+        "cpu_s": usage.cpu_s,
         "peak_mb": usage.peak_mb,
     }
     written = found["correction"].get("pixel_map")

@@ -29,7 +29,9 @@ class Peer:
     requirements : tuple of tuple of str
         Arguments of one ``pip install`` after the other.
     settings : tuple of str
-        Settings of the adapter, tried on every scene.
+        Settings of the adapter, tried on every pair.
+    local : bool
+        Whether the adapter has the setting ``local``, which follows pairs that bend.
     python : str or None
         Interpreter to build on; this one when None.
     probe : str
@@ -42,14 +44,19 @@ class Peer:
     script: str
     requirements: tuple[tuple[str, ...], ...]
     probe: str
-    settings: tuple[str, ...] = ("default", "best")
+    settings: tuple[str, ...] = ("default", "expert")
     python: str | None = None
     command: str | None = None
+    local: bool = False
 
 
-AROSICS_INSTALLS = (
+DEBIAN_GDAL = (
     ("setuptools<70", "wheel", "numpy<2"),
     ("--no-build-isolation", "--no-deps", "gdal==3.6.2.*"),
+)
+"""Python's bindings of the GDAL that Debian 12 has (``libgdal-dev``)."""
+AROSICS = (
+    *DEBIAN_GDAL,
     ("--no-deps", "arosics==1.13.2", "geoarray==0.19.0", "py_tools_ds==0.23.2"),
     (
         "numpy<2", "cartopy", "cmocean", "folium>=0.6,!=0.12.0", "geojson", "geopandas",
@@ -57,19 +64,34 @@ AROSICS_INSTALLS = (
         "shapely", "packaging", "spectral", "dill", "pykrige", "scikit-learn",
     ),
 )  # fmt: skip
-
+KARIOS = (
+    *DEBIAN_GDAL,
+    (
+        "numpy<2", "rasterio>=1.4", "pyproj>=3.6", "opencv-python-headless<4.12", "pandas",
+        "matplotlib", "scikit-image", "scipy",
+    ),
+    (
+        "--no-deps", "--ignore-requires-python",
+        "karios @ git+https://github.com/telespazio-tim/karios",
+    ),
+)  # fmt: skip
+"""It asks for Python 3.12; what is used of it runs in 3.11."""
 OPENCV = (("opencv-python-headless>=5", *RASTERS),)
+PANDORA2D = (("pandora2d==1.2.0", *RASTERS),)
+SYSTEM = "/usr/bin/python3"
 
 PEERS: tuple[Peer, ...] = (
     Peer("OpenCV SIFT + RANSAC", "opencv_sift", OPENCV, "import cv2"),
     Peer("half-size SIFT", "half_size_sift", OPENCV, "import cv2", settings=("default",)),
     Peer("OpenCV ECC", "opencv_ecc", OPENCV, "import cv2"),
-    Peer("SIFT + MAGSAC, ECC on a band mix", "opencv_expert", OPENCV, "import cv2", ("best",)),
+    Peer("SIFT + MAGSAC, then ECC", "opencv_expert", OPENCV, "import cv2", ("expert",)),
+    Peer("OpenCV DIS optical flow", "opencv_dis", OPENCV, "import cv2", (), local=True),
     Peer("phase correlation", "phase_correlation", (("scikit-image", *RASTERS),), "import skimage"),
-    Peer("SimpleITK affine MI", "simpleitk", (("SimpleITK", *RASTERS),), "import SimpleITK"),
-    Peer("elastix affine", "elastix", (("itk-elastix", *RASTERS),), "import itk"),
-    Peer("AROSICS", "arosics_peer", AROSICS_INSTALLS, "import arosics", python="/usr/bin/python3"),
-    Peer("pandora2d", "pandora2d_peer", (("pandora2d==1.2.0", *RASTERS),), "import pandora2d"),
+    Peer("SimpleITK", "simpleitk", (("SimpleITK", *RASTERS),), "import SimpleITK", local=True),
+    Peer("elastix", "elastix", (("itk-elastix", *RASTERS),), "import itk", local=True),
+    Peer("AROSICS", "arosics_peer", AROSICS, "import arosics", python=SYSTEM, local=True),
+    Peer("KARIOS", "karios_peer", KARIOS, "import karios.matcher.klt", python=SYSTEM, local=True),
+    Peer("pandora2d", "pandora2d_peer", PANDORA2D, "import pandora2d", local=True),
     Peer("coregix", "coregix_peer", (("coregix==0.3.0", "scipy", *RASTERS),), "import coregix"),
     Peer(
         "OTB SIFT", "otb_sift", OPENCV, "import cv2",

@@ -20,13 +20,16 @@ from benchmarks.peers.environments import (
     environment,
     own_command,
 )
-from benchmarks.processes import measured, own_environment
+from benchmarks.processes import Usage, measured, own_environment
 from benchmarks.records import read_transform
 from benchmarks.report import machine
 from benchmarks.scenes.truth import Truth, grid_rmse
 
 CACHE = Path(__file__).parents[1] / ".cache"
 QUICK_SCENES = ("A", "C", "G")
+LOCAL = "local"
+TIMEOUT_S = 300.0
+"""For every tool, as tables say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +77,34 @@ class Tool:
         ]  # fmt: skip
 
 
+def attempt(tool: Tool, folder: Path, timeout_s: float) -> tuple[Usage, Path, str]:
+    """Run a tool on ``ms.tif`` and ``pan.tif`` of a folder that holds nothing else.
+
+    Returns
+    -------
+    usage : Usage
+    out : Path
+        What the tool wrote, if it did.
+    failure : str
+        Why it wrote nothing; "" when it did.
+    """
+    env = own_environment() if tool.script is None else {**os.environ, "PYTHONPATH": ""}
+    out = folder / ("out.tif" if tool.script is None else "out.json")
+    usage = measured(tool.command(folder, out), env, timeout_s, folder)
+    failed = usage.status or not out.exists()
+    return usage, out, (usage.last_line[:200] or f"exit {usage.status}") if failed else ""
+
+
 def run_tool(tool: Tool, scene: Path, timeout_s: float) -> Result:
     """Run a tool on copies of a scene's rasters, without the truth, and score it."""
     truth = Truth.load(scene / "truth.json")
-    env = own_environment() if tool.script is None else {**os.environ, "PYTHONPATH": ""}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for raster in ("ms.tif", "pan.tif"):
             shutil.copy(scene / raster, folder / raster)
-        out = folder / ("out.tif" if tool.script is None else "out.json")
-        usage = measured(tool.command(folder, out), env, timeout_s, folder)
-        error, failure = dict.fromkeys(("rmse_px", "p95_px", "max_px"), math.nan), ""
-        if usage.status or not out.exists():
-            failure = usage.last_line[:200] or f"exit {usage.status}"
-        else:
+        usage, out, failure = attempt(tool, folder, timeout_s)
+        error = dict.fromkeys(("rmse_px", "p95_px", "max_px"), math.nan)
+        if not failure:
             error = grid_rmse(read_transform(out), truth)
     return Result(
         truth.name, tool.name, tool.setting, **error, wall_s=usage.wall_s, cpu_s=usage.cpu_s,
@@ -95,18 +112,22 @@ def run_tool(tool: Tool, scene: Path, timeout_s: float) -> Result:
     )  # fmt: skip
 
 
-def available_tools(cache: Path, only: set[str]) -> Iterator[Tool]:
-    """geodelreg, then every peer that can be built; the others are named with the reason."""
-    yield Tool(OWN, "default", None, None)
+def available_tools(cache: Path, only: set[str], local: bool = False) -> Iterator[Tool]:
+    """geodelreg, then every peer that can be built; the others are named with the reason.
+
+    With `local`, the peers that follow what bends, with that setting.
+    """
+    yield Tool(OWN, LOCAL if local else "default", None, None)
     for peer in PEERS:
-        if only and peer.script not in only:
+        settings = (LOCAL,) * peer.local if local else peer.settings
+        if not settings or (only and peer.script not in only):
             continue
         try:
             python = environment(peer, cache)
         except PeerUnavailableError as error:
             print(f"{peer.name}: skipped, {error}", flush=True)
             continue
-        for setting in peer.settings:
+        for setting in settings:
             yield Tool(peer.name, setting, python, ADAPTERS / f"{peer.script}.py")
 
 
@@ -120,7 +141,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
     parser.add_argument("--quick", action="store_true", help="scenes A, C and G only")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each, the fastest counts")
-    parser.add_argument("--timeout", type=float, default=300.0, help="seconds a run may take")
+    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds a run may take")
     parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
     parser.add_argument("--docs", type=Path, help="page whose section is replaced")
 
@@ -155,5 +176,5 @@ def run(args: argparse.Namespace) -> int:
     if args.docs:
         from benchmarks.peers.table import write_page
 
-        write_page(args.out, args.docs)
+        write_page(args.out, args.docs, args.timeout)
     return 0

@@ -14,14 +14,15 @@ from benchmarks.report import replace_section
 FAILED_PX = 1.0
 CAVEATS = """How to read it:
 
-- geodelreg was developed on these very scenes. The peers were not tuned on them: `best` is one
-  richer setting each (visible bands, finer grid, more samples, local tie points), written down once
-  and not searched for; it can be worse than `default`, and an expert would do better: see the next
-  section. Other scripts around some of the same tools have got 0.02 to 0.05 px on comparable scenes
-  (shift, 4:1).
-- Phase correlation and global AROSICS estimate a shift only; most peers are made for headers that
-  are a few pixels off and nearly unrotated, so C is outside what they promise.
-- An affine through AROSICS's, pandora2d's and Orfeo ToolBox's points is the adapter's, not theirs.
+- geodelreg was developed on these very scenes. The peers were not tuned on them, but for SIFT +
+  MAGSAC, then ECC. `expert` is what somebody who knows the tool would set, on the bands weighted as
+  PAN sees them; `benchmarks/README.md` says which settings, and after which source.
+- PAN is a positive mix of the MS bands in A to J and aerial, which is geodelreg's own model, and
+  that of every expert's setting here. In K PAN holds light that no MS band saw, L has 8 bits and
+  JPEG's loss, M soft optics.
+- Phase correlation and AROSICS's default estimate a shift only; most peers are made for headers
+  that are a few pixels off and nearly unrotated, so C is outside what they promise.
+- An affine through the points of AROSICS, KARIOS, pandora2d and Orfeo ToolBox is the adapter's.
 - G has bright clouds that move by 6 and 9 px between the images; what is 5 to 9 px off follows
   them, or moved nothing."""
 NOISE_FLOOR = {"rmse_px": 0.002, "wall_s": 0.3, "peak_mb": 20.0}
@@ -61,8 +62,10 @@ def markdown(results: Results) -> str:
 
 def standing(results: Results) -> str:
     """One line a scene: geodelreg against the most accurate and the fastest usable peer."""
-    lines = ["| scene | geodelreg | most accurate peer | fastest peer under 0.3 px |"]
-    lines.append("|---|---|---|---|")
+    lines = [
+        "| scene | geodelreg | most accurate peer | its error over ours | fastest under 0.3 px |"
+    ]
+    lines.append("|---" * 5 + "|")
     for scene in dict.fromkeys(result["scene"] for result in results):
         part = [result for result in results if result["scene"] == scene]
         own = next((result for result in part if result["tool"] == OWN), None)
@@ -74,6 +77,9 @@ def standing(results: Results) -> str:
             "–" if r is None else f"{_label(r)}: {r['rmse_px']:.4f} px, {r['wall_s']:.1f} s"
             for r in (own, best, fastest)
         ]
+        known = own is not None and best is not None and own["rmse_px"] > 0
+        times = f"{best['rmse_px'] / own['rmse_px']:.1f} ×" if known and own and best else "–"
+        cells.insert(2, times)
         lines.append(f"| {scene} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -117,7 +123,7 @@ def failures(results: Results) -> str:
     return "\n".join(lines)
 
 
-def write_page(source: Path, page: Path) -> None:
+def write_page(source: Path, page: Path, timeout_s: float) -> None:
     """Replace the section ``peers`` of a page, and its plot beside it."""
     name, results = load(source)
     image = page.parent / "images" / "accuracy_versus_time.png"
@@ -125,7 +131,7 @@ def write_page(source: Path, page: Path) -> None:
     text = (
         "## Side by side with other tools\n\n"
         "`python -m benchmarks peers --scenes DIR --out FILE --docs docs/benchmarks.md` "
-        f"({name}).\n\n"
+        f"({name}; {timeout_s:g} s for each run).\n\n"
         "Each cell: RMSE in PAN px / wall time of the whole process, largest resident set; "
         "– = failed, or more than 1 px off.\n\n"
         f"{CAVEATS}\n\n{markdown(results)}\n\n{standing(results)}\n\n"

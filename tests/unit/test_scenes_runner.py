@@ -181,11 +181,11 @@ def test_page_names_the_best_and_the_fastest_peer_and_the_wrong_ones(tmp_path: P
         _result(tool="broken", rmse_px=float("nan"), failure="no luck"),
     )
     page = tmp_path / "docs" / "page.md"
-    table.write_page(source, page)
+    table.write_page(source, page, 90.0)
     text = page.read_text()
     assert (
         "| A | geodelreg: 0.0040 px, 2.0 s | accurate, default: 0.0100 px, 30.0 s "
-        "| fast, default: 0.2500 px, 1.0 s |" in text
+        "| 2.5 × | fast, default: 0.2500 px, 1.0 s |" in text
     )
     assert "- A, wrong, default: 200.0 px off, no error raised" in text
     assert "- A, broken, default: no luck" in text

@@ -4,14 +4,20 @@ Each adapter is a script that runs in the peer's own environment::
 
     python opencv_sift.py --ms ms.tif --pan pan.tif --out result.json --setting default
 
-and writes the corrected geotransform of MS, in the MS CRS.  Positions are outer-corner pixel
-coordinates ``(column, row)``.
+and writes the corrected geotransform of MS, in the MS CRS; with the setting ``local`` the PAN
+positions of the check points of MS.  Positions are outer-corner pixel coordinates
+``(column, row)``.
+
+The settings: ``default`` is what the tool does by itself, on the mean of the bands.  ``expert`` is
+what somebody who knows it would set, on the bands weighted as PAN sees them (`on_band_mix`) and
+with PAN low-passed as MS is (`pan_as_ms`).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +32,10 @@ from rasterio.warp import reproject
 
 FloatArray = NDArray[np.float64]
 FITTING_POINTS = 15
+CHECK_POINTS_PER_SIDE = 21
+PIXEL_SIGMA = 0.45
+"""Blur of a pixel and its optics, in MS pixels, that did best with ECC on the project's scenes."""
+KERNEL_SIGMAS = 3.0
 
 
 def arguments(*settings: str) -> argparse.Namespace:
@@ -57,7 +67,7 @@ class Pair:
     pan_crs: Any
 
     def ms_grey(self, setting: str) -> NDArray[np.float32]:
-        """What is matched on: by default the mean of all bands, at best of the visible three."""
+        """What is matched on first: by default the mean of all bands, else of the visible three."""
         bands = self.ms if setting == "default" else self.ms[:3]
         return np.asarray(bands.mean(axis=0), dtype=np.float32)
 
@@ -115,9 +125,61 @@ def pan_on_ms_grid(pair: Pair, zoom: int = 1) -> NDArray[np.float32]:
     return out
 
 
-def ms_zoomed(pair: Pair, setting: str, zoom: int) -> NDArray[np.float32]:
-    """Grey MS image resampled by GDAL to pixels divided by `zoom`."""
-    grey = pair.ms_grey(setting)
+def pan_as_ms(pair: Pair, zoom: int = 1, transform: Affine | None = None) -> NDArray[np.float32]:
+    """PAN with the blur of an MS pixel, by a cubic on the grid of MS (pixels divided by `zoom`).
+
+    Parameters
+    ----------
+    pair : Pair
+    zoom : int
+    transform : Affine, optional
+        Of MS; its header's by default.
+    """
+    height, width = pair.ms.shape[1] * zoom, pair.ms.shape[2] * zoom
+    out = np.zeros((height, width), np.float32)
+    reproject(
+        blurred(pair.pan, PIXEL_SIGMA * pair.ratio), out, src_transform=pair.pan_transform,
+        src_crs=pair.pan_crs,
+        dst_transform=(transform or pair.ms_transform) @ Affine.scale(1 / zoom),
+        dst_crs=pair.ms_crs, resampling=Resampling.cubic,
+    )  # fmt: skip
+    return out
+
+
+def blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Gaussian blur, edges repeated."""
+    reach = int(np.ceil(KERNEL_SIGMAS * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).astype(np.float32)
+    for axis in (0, 1):
+        size = image.shape[axis]
+        edge = [(reach, reach) if axis == a else (0, 0) for a in (0, 1)]
+        padded = np.pad(image, edge, mode="edge")
+        image = np.zeros_like(image)
+        for k, weight in enumerate(kernel):
+            image += weight * np.take(padded, range(k, k + size), axis=axis)
+    return image
+
+
+def band_mix(pair: Pair, matrix: FloatArray) -> NDArray[np.float32]:
+    """The bands weighted as PAN sees them, by least squares under a correction of the MS grid."""
+    seen = pan_as_ms(pair, 1, pair.ms_transform @ Affine(*matrix.ravel()))
+    known = (seen > 0) & (pair.ms > 0).all(axis=0)
+    design = np.column_stack([*pair.ms[:, known], np.ones(int(known.sum()))])
+    weights = np.linalg.lstsq(design, seen[known], rcond=None)[0]
+    return np.asarray(np.tensordot(weights[:-1], pair.ms, axes=1), dtype=np.float32)
+
+
+def on_band_mix(pair: Pair, find: Callable[[NDArray[np.float32]], FloatArray]) -> FloatArray:
+    """(2, 3) correction of the MS grid that `find` gives on the best mix of the bands.
+
+    The mix needs a place, so `find` is called twice, first with the mean of the visible bands.
+    """
+    return find(band_mix(pair, find(pair.ms_grey("expert"))))
+
+
+def ms_zoomed(pair: Pair, grey: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
+    """A grey MS image resampled by GDAL to pixels divided by `zoom`."""
     if zoom == 1:
         return grey
     height, width = pair.ms.shape[1:]
@@ -164,6 +226,36 @@ def save_pixel_match(args: argparse.Namespace, pair: Pair, matrix: FloatArray) -
     if pair.ms_crs != pair.pan_crs:
         x, y = Transformer.from_crs(pair.pan_crs, pair.ms_crs, always_xy=True).transform(x, y)
     save(args, Affine(*fit_affine(points, np.stack([x, y], axis=1)).ravel()))
+
+
+def check_points(shape: tuple[int, ...]) -> FloatArray:
+    """(441, 2) positions from corner to corner of MS, where a local result is said."""
+    steps = (np.linspace(0, size, CHECK_POINTS_PER_SIDE) for size in (shape[1], shape[0]))
+    return np.stack([axis.ravel() for axis in np.meshgrid(*steps)], axis=1)
+
+
+def save_on_grid(args: argparse.Namespace, pair: Pair, on_grid: FloatArray) -> None:
+    """Write where the check points lie in PAN.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+    pair : Pair
+    on_grid : (441, 2)
+        Where their content lies in PAN warped to the MS header's grid, MS pixels.
+    """
+    args.out.write_text(json.dumps({"points": pair.ms_to_pan_px(on_grid).tolist()}))
+
+
+def sampled(field: FloatArray, at: FloatArray, zoom: int = 1) -> FloatArray:
+    """A field (h, w, 2) of pixels divided by `zoom`, linear between their centres, at `at`."""
+    size = np.array(field.shape[1::-1])
+    place = np.clip(at * zoom - 0.5, 0, size - 1)
+    low = np.minimum(place.astype(int), size - 2)
+    (u, v), (column, row) = (place - low).T[..., None], low.T
+    upper = field[row, column] * (1 - u) + field[row, column + 1] * u
+    lower = field[row + 1, column] * (1 - u) + field[row + 1, column + 1] * u
+    return np.asarray(upper * (1 - v) + lower * v)
 
 
 def save(args: argparse.Namespace, transform: Affine) -> None:

@@ -12,8 +12,8 @@ OUTSIDE = -1000.0
 
 
 def main() -> None:
-    """Default: as it comes.  Best: from coarse to fine, for large offsets."""
-    args = arguments("default", "best")
+    """Default: as it comes.  Expert: from coarse to fine, for large offsets."""
+    args = arguments("default", "expert")
     pair = read_pair(args)
     height, width = pair.ms.shape[1:]
     row, column = np.mgrid[:height, :width] + 0.5
@@ -24,7 +24,7 @@ def main() -> None:
     ) as raster:  # fmt: skip
         raster.write(np.stack([pair.ms_grey(args.setting), column, row]).astype(np.float32))
     steps = {}
-    if args.setting == "best":
+    if args.setting == "expert":
         size = abs(pair.pan_transform.a)
         steps = {"solve_resolutions": [16 * size, 4 * size, size], "split_factor": 1}
     align_image_pair(str(moving), str(args.pan), str(aligned), **steps)

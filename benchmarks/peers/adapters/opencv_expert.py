@@ -49,7 +49,7 @@ def band_mix(ms: np.ndarray, pan: np.ndarray, matrix: FloatArray) -> np.ndarray:
 
 def main() -> None:
     """Find the affine and save the geotransform."""
-    args = arguments("best")
+    args = arguments("expert")
     pair = read_pair(args)
     cv2.setRNGSeed(0)
     sigma = PIXEL_SIGMA * pair.ratio

@@ -31,8 +31,8 @@ def _match(
 
 
 def main() -> None:
-    """Default: MS magnified to PAN, RANSAC.  Best: both at the MS GSD, no SIFT bias, MAGSAC."""
-    args = arguments("default", "best")
+    """Default: MS magnified to PAN, RANSAC.  Expert: both at the MS GSD, no SIFT bias, MAGSAC."""
+    args = arguments("default", "expert")
     cv2.setRNGSeed(0)
     pair = read_pair(args)
     height, width = pair.ms.shape[1:]

@@ -11,7 +11,7 @@ from common import apply_transform, arguments, fit_affine, read_pair, save_pixel
 RED_BAND = 3
 SETTINGS = {
     "default": ("-mode.geobins.binsize", "256", "-mode.geobins.binstep", "256"),
-    "best": (
+    "expert": (
         "-mode.geobins.binsize", "128", "-mode.geobins.binstep", "64", "-threshold", "0.8",
         "-backmatching", "true",
     ),
@@ -20,7 +20,7 @@ SETTINGS = {
 
 def main() -> None:
     """Default bins, or small overlapping ones; MAGSAC and least squares on what comes out."""
-    args = arguments("default", "best")
+    args = arguments("default", "expert")
     points = args.out.with_suffix(".txt")
     subprocess.run(
         [
