@@ -174,17 +174,17 @@ def test_page_names_the_best_and_the_fastest_peer_and_the_wrong_ones(tmp_path: P
     source = _save(
         tmp_path / "r.json",
         _result(),
-        _result(tool="accurate", rmse_px=0.01, wall_s=30.0),
-        _result(tool="fast", rmse_px=0.25, wall_s=1.0),
-        _result(tool="faster but poor", rmse_px=0.5, wall_s=0.5),
-        _result(tool="wrong", rmse_px=200.0, wall_s=0.1),
+        _result(tool="accurate", rmse_px=0.01, cpu_s=30.0),
+        _result(tool="fast", rmse_px=0.25, cpu_s=1.0),
+        _result(tool="faster but poor", rmse_px=0.5, cpu_s=0.5),
+        _result(tool="wrong", rmse_px=200.0, cpu_s=0.1),
         _result(tool="broken", rmse_px=float("nan"), failure="no luck"),
     )
     page = tmp_path / "docs" / "page.md"
     table.write_page(source, page, 90.0)
     text = page.read_text()
     assert (
-        "| A | geodelreg: 0.0040 px, 2.0 s | accurate, default: 0.0100 px, 30.0 s "
+        "| A | geodelreg: 0.0040 px, 2.5 s | accurate, default: 0.0100 px, 30.0 s "
         "| 2.5 × | fast, default: 0.2500 px, 1.0 s |" in text
     )
     assert "- A, wrong, default: 200.0 px off, no error raised" in text
