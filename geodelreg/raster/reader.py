@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from types import TracebackType
@@ -15,14 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geodelreg.door.names import LOCAL
-from geodelreg.errors import BandGridError, BandNumberError
+from geodelreg.errors import BandNumberError
 from geodelreg.geo.grid import decimated_grid
-from geodelreg.raster.environment import (
-    TILES_BYTES,
-    bounded_cache,
-    gdal_calls,
-    passing_through,
-)
+from geodelreg.raster.bands import FileBand, image_files, list_bands
+from geodelreg.raster.environment import TILES_BYTES, bounded_cache, passing_through
 from geodelreg.raster.inputs import AnyMask, AnyRaster, opened, rasters_of
 from geodelreg.raster.raster_file import RasterFile
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
@@ -34,15 +29,6 @@ logger = logging.getLogger(__name__)
 
 _EXACT_PIXELS = 16_000_000
 """Windows up to this size are averaged from full resolution, whatever the overviews hold."""
-
-
-@dataclass(frozen=True, slots=True)
-class _FileBand:
-    """Where a band of the image is stored."""
-
-    file: int
-    number: int
-    name: str
 
 
 class RasterReader:
@@ -74,14 +60,14 @@ class RasterReader:
         with ExitStack() as stack:
             stack.enter_context(bounded_cache())
             files = [RasterFile(opened(one, stack, allow), stack) for one in rasters]
-            self._files = _on_the_common_grid(_with_image_bands(files))
+            self._files = image_files(files)
             self.paths = tuple(file.path for file in self._files)
             self.masks = self._open_masks(files, masks, stack, allow)
             self._stack = stack.pop_all()
         self.given = tuple(file.path for file in files)
         self.in_memory = not all(file.opened.is_file for file in files)
         self.other_paths = tuple(file.path for file in files if file not in self._files)
-        self._bands = _list_bands(self._files)
+        self._bands = list_bands(self._files)
         self._stored = [(self._files[band.file], band.number) for band in self._bands]
         self._decimations = self._common_decimations()
 
@@ -215,7 +201,7 @@ class RasterReader:
         self._check_window(window, shape)
         grid = decimated_grid(self.grid, window, shape)
         wanted = [self._bands[number - 1] for number in bands]
-        planes: dict[_FileBand, tuple[Float32Array, BoolArray]] = {}
+        planes: dict[FileBand, tuple[Float32Array, BoolArray]] = {}
         with self._lock:
             for index, group in groupby(sorted(set(wanted), key=_storage), lambda b: b.file):
                 stored = list(group)
@@ -288,66 +274,8 @@ class RasterReader:
         return (1.0, *(shared if same else ()))
 
 
-def _storage(band: _FileBand) -> tuple[int, int]:
+def _storage(band: FileBand) -> tuple[int, int]:
     return band.file, band.number
-
-
-def _with_image_bands(files: list[RasterFile]) -> list[RasterFile]:
-    """Files that show something; of nothing but quality bands, their bands are the image."""
-    showing = [file for file in files if file.image_bands]
-    for file in [] if showing else files:
-        file.image_bands = tuple(file.quality_bands)
-    return showing or files
-
-
-def _on_the_common_grid(files: list[RasterFile]) -> list[RasterFile]:
-    """Files on the grid that most of them share; on a tie the finest."""
-    from rasterio.crs import CRS
-
-    first = files[0]
-    with gdal_calls():
-        crs = CRS.from_wkt(first.grid.crs_wkt)
-        for file in files[1:]:
-            if file.grid.crs_wkt != first.grid.crs_wkt and CRS.from_wkt(file.grid.crs_wkt) != crs:
-                raise BandGridError(
-                    f"{first.path} and {file.path} have different coordinate reference systems",
-                    "Bands of one image share one; align images with different ones separately.",
-                )
-    groups: list[list[RasterFile]] = []
-    for file in files:
-        group = next((g for g in groups if _same_grid(g[0].grid, file.grid)), None)
-        if group is None:
-            groups.append([file])
-        else:
-            group.append(file)
-    return max(groups, key=lambda g: (len(g), -abs(g[0].grid.transform.determinant)))
-
-
-def _same_grid(one: Grid, other: Grid) -> bool:
-    """Same size, and no corner apart by more than a thousandth of a pixel."""
-    if one.shape != other.shape:
-        return False
-    height, width = one.shape
-    offset = ~one.transform @ other.transform
-    corners = ((0, 0), (width, 0), (0, height), (width, height))
-    return all(np.hypot(*np.subtract(offset @ corner, corner)) <= 1e-3 for corner in corners)
-
-
-def _list_bands(files: list[RasterFile]) -> list[_FileBand]:
-    bands: list[_FileBand] = []
-    taken: set[str] = set()
-    for index, file in enumerate(files):
-        descriptions = file.dataset.descriptions
-        for number in file.image_bands:
-            name = descriptions[number - 1] or f"band {number}"
-            if len(files) > 1:
-                stem = Path(file.path).stem
-                name = stem if len(file.image_bands) == 1 else f"{stem} {name}"
-            if name in taken:
-                name = f"{name} ({len(bands) + 1})"
-            taken.add(name)
-            bands.append(_FileBand(index, number, name))
-    return bands
 
 
 def open_raster(
