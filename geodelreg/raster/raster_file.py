@@ -26,7 +26,6 @@ from geodelreg.raster.fill import undeclared_fill
 from geodelreg.raster.inputs import Opened
 from geodelreg.raster.overviews import Placement, find_placement
 from geodelreg.raster.validity import alpha_bands, bands_with_mask, differs_from_nodata
-from geodelreg.values.drawn import drawn_values
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, Grid, Window
 
 if TYPE_CHECKING:
@@ -41,10 +40,6 @@ _WHOLE_BLOCK_PIXELS = 4 * _PIECE_PIXELS
 _MOST_THREADS = 4
 _PIECES_PER_THREAD = 4
 """Fewer are read sooner than more handles of the file are opened."""
-
-_LOOKS, _LOOK_PX = 8, 32
-"""Windows along either axis, and their side, that show what is drawn: 65 536 pixels, as many as
-`geodelreg.values.drawn` wants to see."""
 
 _LARGE_BLOCK_BYTES = 64_000_000
 
@@ -131,23 +126,6 @@ class RasterFile:
                 return _read(self.dataset, self.image_bands, window)
 
         return undeclared_fill(read, (height, width), self.dataset.dtypes[0])
-
-    def drawn_values(self) -> dict[int, FloatArray]:
-        """Values that are drawn on each image band, by its number; empty unless on all of them."""
-        if self.block_note:
-            return {}
-        height, width = self.grid.shape
-        down, across = min(_LOOK_PX, height), min(_LOOK_PX, width)
-        seen: dict[int, list[Float32Array]] = {number: [] for number in self.image_bands}
-        for row in np.unique(np.linspace(0, height - down, _LOOKS).astype(int)):
-            for column in np.unique(np.linspace(0, width - across, _LOOKS).astype(int)):
-                data, valid = self.read(
-                    self.image_bands, Window(int(column), int(row), across, down)
-                )
-                for plane, number in enumerate(self.image_bands):
-                    seen[number].append(data[plane][valid[plane]])
-        found = {number: drawn_values(np.concatenate(seen[number])) for number in seen}
-        return found if all(map(len, found.values())) else {}
 
     @property
     def block_note(self) -> str:

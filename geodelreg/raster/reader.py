@@ -17,6 +17,7 @@ from geodelreg.door.names import LOCAL
 from geodelreg.errors import BandNumberError
 from geodelreg.geo.grid import decimated_grid
 from geodelreg.raster.bands import FileBand, image_files, list_bands
+from geodelreg.raster.drawn import leave_out_drawn
 from geodelreg.raster.environment import TILES_BYTES, bounded_cache, passing_through
 from geodelreg.raster.inputs import AnyMask, AnyRaster, opened, rasters_of
 from geodelreg.raster.raster_file import RasterFile
@@ -129,12 +130,7 @@ class RasterReader:
         return "; ".join(file.block_note for file in self._files if file.block_note)
 
     def leave_out(self, nodata: float | None) -> str:
-        """Take a value for no data, or fill that the files do not declare.
-
-        Parameters
-        ----------
-        nodata : float or None
-            None looks for constant areas of 0, or of the type's largest value, at the corners.
+        """Take a value for no data; None is for fill at the corners that the files do not declare.
 
         Returns
         -------
@@ -152,21 +148,8 @@ class RasterReader:
         return "; ".join(notes)
 
     def leave_out_drawn(self) -> str:
-        """Take what is drawn on all image bands, as `geodelreg.values.drawn` says, for no data.
-
-        Returns
-        -------
-        str
-            What is left out from now on; empty when nothing is.
-        """
-        found = [file.drawn_values() for file in self._files]
-        if not all(found):
-            return ""
-        for file, drawn in zip(self._files, found, strict=True):
-            file.drawn = drawn
-        every = np.unique(np.concatenate([values for of in found for values in of.values()]))
-        listed = " and ".join(f"{value:g}" for value in every)
-        return f"what is drawn on {self.name} with the value {listed} is left out"
+        """What is drawn on all bands, and no data from now on, in words; empty when nothing is."""
+        return leave_out_drawn(self._files, self.name)
 
     def read(
         self, bands: Sequence[int], window: Window, shape: tuple[int, int] | None = None
