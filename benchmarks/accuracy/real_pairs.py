@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from affine import Affine
 
+from benchmarks.accuracy import quadrants
 from benchmarks.accuracy.measure import (
     MeasureOptions,
     Offsets,
@@ -183,25 +184,46 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def by_quadrants(pairs: list[Pair], data: Path) -> str:
+    """Table of each quarter of the pairs against the other three."""
+    found: list[quadrants.Quadrant] = []
+    refused: dict[str, int] = {}
+    for pair in pairs:
+        four = list(quadrants.quadrants(pair.name, data / pair.ms, data / pair.pan, pair.pan_band))
+        found += [one for one in four if one is not None]
+        refused[pair.name] = four.count(None)
+    return quadrants.table(found, refused)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks real``."""
     parser.add_argument("--data", type=Path, required=True, help="folder with the real pairs")
     parser.add_argument("--only", default="", help="names, comma-separated")
     parser.add_argument("--out", type=Path, help="JSON file for the rows")
     parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+    parser.add_argument(
+        "--quadrants", action="store_true", help="each quarter against the other three, instead"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Align every pair that is there; print the table, in PAN pixels."""
     wanted = {name for name in args.only.split(",") if name}
-    rows = []
+    there = []
     for pair in PAIRS:
         if wanted and pair.name not in wanted:
             continue
         if not (args.data / pair.ms).exists() or not (args.data / pair.pan).exists():
             print(f"{pair.name}: skipped, not in {args.data}")
             continue
-        rows.append(align_pair(pair, args.data))
+        there.append(pair)
+    if args.quadrants:
+        page = by_quadrants(there, args.data)
+        print(page)
+        if args.docs:
+            replace_section(args.docs, "quadrants", page)
+        return 0
+    rows = [align_pair(pair, args.data) for pair in there]
     print(table(rows))
     if args.out:
         save(args.out, rows)

@@ -10,13 +10,15 @@ import math
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy import ndimage
 
 import geodelreg
+from benchmarks.accuracy.measure import MeasureOptions, Raster, measure_offsets
 from benchmarks.gate.cases import imagery_of
 from benchmarks.report import replace_section
 from benchmarks.scenes.imagery import Imagery
@@ -50,6 +52,14 @@ LIGHT = {
 SIDES_PX = ((900, 4.0), (500, 2.0))  # of PAN, and the ratio of pixel sizes
 LAND_PX = (0.5, 0.6)  # of the imagery's sides: where crops may be centred about its middle
 MS_SHARE = 0.9
+GREEN = 1
+MEASURED_PX = 1400
+ALIKE = MeasureOptions(64, 64, windows_per_side=10, search_px=3.0, minimum_score=0.8)
+FEWEST_WINDOWS = 20
+SURE_SIGMAS = 3.0
+MAD_TO_SIGMA, MEDIAN_OVER_MEAN = 1.4826, 1.2533
+"""Of normal errors: standard deviation over median deviation, and the standard error of a median
+over that of a mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +78,35 @@ class Draw:
         return self.error_px / self.sigma_px
 
 
+def together(imagery: Imagery) -> Imagery:
+    """The imagery with its bands moved to where its green one is, where they surely lie apart.
+
+    Bands of a product can lie some tenths of a pixel apart, as infrared and green of Sentinel-2 do.
+    Any mix of them then has a place of its own, and no truth.  The distance is measured by
+    windows that look alike in both, which share no code with the library.
+    """
+    bands = imagery.bands.copy()
+    part = np.s_[:MEASURED_PX, :MEASURED_PX]
+    valid = np.asarray((bands[:, *part] > 0).all(axis=0))
+    seen = [
+        Raster(band[None][:, *part], valid, imagery.transform, imagery.crs_wkt) for band in bands
+    ]
+    for band, one in enumerate(seen):
+        found = measure_offsets(one, seen[GREEN], ALIKE)
+        if band == GREEN or len(found.score) < FEWEST_WINDOWS:
+            continue
+        offset = np.array(found.median_px)
+        spread = MAD_TO_SIGMA * np.median(np.abs(found.offset_px - offset), axis=0)
+        error = np.hypot(*spread) * MEDIAN_OVER_MEAN / math.sqrt(len(found.score))
+        if np.hypot(*offset) > SURE_SIGMAS * error:
+            bands[band] = ndimage.shift(bands[band], -offset[::-1], order=3, mode="nearest")
+    return replace(imagery, bands=bands)
+
+
 def draws(data: Path, repeat: int) -> Iterator[Draw | None]:
     """Every light on crops of every source; None of a pair that was refused."""
     for source in SOURCES:
-        imagery = imagery_of(source, data)
+        imagery = together(imagery_of(source, data))
         for number in range(repeat):
             rng = np.random.default_rng(zlib.crc32(f"{source} {number}".encode()))
             wanted, ratio = SIDES_PX[number % len(SIDES_PX)]
