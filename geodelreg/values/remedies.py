@@ -74,8 +74,9 @@ _OTHERWISE = (
 
 
 _DRAWN = (
-    "Labels, a collar or the like are drawn on both images with one value: say that it is no data "
-    "(`ms_nodata`, `pan_nodata`), and the ground is matched without them."
+    "Labels, a collar or the like are drawn on both images, and too little of the ground beside "
+    "them agrees: show more of the scene, or mask what is drawn with other values than those named "
+    "(`ms_nodata`, `pan_nodata`, `mask`)."
 )
 """Comes before all others: what is drawn disturbs everything else that is measured."""
 
