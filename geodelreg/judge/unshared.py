@@ -26,7 +26,7 @@ PULL_PX = 0.11
 
 Set on 199 simulated pairs of six sources, PAN and MS of different bands, so that the normalised
 error has an RMS of 1 when each source counts the same; on others of these sources
-(`python -m benchmarks unshared`) it has 1.2."""
+(`python -m benchmarks unshared`) it has 0.8 to 0.9, of bands that were brought together."""
 _PATCHES = 150  # their mean is known to a tenth
 _NEIGHBOURS = 0.3
 """Correlation of adjoining pixels of structure finer than a pixel: exp(−1 / 4σ²) behind the usual
