@@ -119,7 +119,10 @@ def _tiles(shape: tuple[int, ...], whole_px: int) -> list[_Tile]:
     if shape[0] * shape[1] <= whole_px:
         whole = (slice(0, shape[0]), slice(0, shape[1]))
         return [_Tile(whole, whole)]
-    rows, columns = (_spans(side) for side in shape)
+    # two halves have the least margins; more parts are as square as they can be
+    rows, columns = _spans(shape[0], 2), _spans(shape[1], 1)
+    if max(around.stop - around.start for _, around in rows) * shape[1] > whole_px:
+        rows, columns = (_spans(side, max(round(side / _TILE_PX), 1)) for side in shape)
     return [
         _Tile((row, column), (around_row, around_column))
         for row, around_row in rows
@@ -127,9 +130,8 @@ def _tiles(shape: tuple[int, ...], whole_px: int) -> list[_Tile]:
     ]
 
 
-def _spans(side: int) -> list[tuple[slice, slice]]:
+def _spans(side: int, count: int) -> list[tuple[slice, slice]]:
     """Cores that start where all octaves have a pixel, and the same with margins."""
-    count = max(round(side / _TILE_PX), 1)
     step = -(-side // (count * _OCTAVES_PX)) * _OCTAVES_PX
     return [
         (

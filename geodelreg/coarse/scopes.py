@@ -14,6 +14,7 @@ from geodelreg.values.points import Overview, Scope
 from geodelreg.values.raster import Window
 
 _FIRST_BUDGET_PX = 250_000  # 500²; unexplained: ablate
+_FINER_BUDGET_PX = 1_000_000  # 1000²: twice as fine
 SECOND_BUDGET_PX = 1_600_000  # 1265²; unexplained: ablate
 _FIRST_KEYPOINTS = 1500  # of each image, and a quarter of what is asked for; unexplained: ablate
 _FINER = 1.01  # times finer; less is rounding to whole pixels
@@ -30,7 +31,7 @@ def scopes(pair: Pair) -> Iterator[Scope]:
         first = Scope(*windows, _FIRST_BUDGET_PX, few, "header overlap")
         yield first
         if working_gsd_m(pair, first) > _FINER * max(*pair.source_gsd_m, *pair.reference_gsd_m):
-            yield Scope(*windows, SECOND_BUDGET_PX, most, "header overlap, finer", is_closer=True)
+            yield Scope(*windows, _FINER_BUDGET_PX, most, "header overlap, finer", is_closer=True)
     if windows != whole:
         name = "both rasters whole"
         yield Scope(whole[0], whole[1], SECOND_BUDGET_PX, most, name, is_whole=True)
