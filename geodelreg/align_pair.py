@@ -20,10 +20,7 @@ from geodelreg.fine.least_squares import Matched
 from geodelreg.fine.matching import patches_log_nfa, tie_points
 from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.fine.passes import Refinement, refine, refine_proven
-from geodelreg.fine.per_band import match_each_band
-from geodelreg.fine.settle import settle
 from geodelreg.fit.choice import Fitted, half_disagreement, select_for
-from geodelreg.fit.field import facets_of, halves_apart, selection_of
 from geodelreg.fit.models import Frame, points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.geo.maps.field import FieldMap
@@ -266,6 +263,8 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     model, reasons = fitted.selection.estimate.model, judge(evidence, options)
     bands: tuple[BandMap, ...] = ()
     if options.per_band and passes(reasons):
+        from geodelreg.fine.per_band import match_each_band
+
         with pair.timings("bands"):
             if refined.part.ms_is_template:
                 bands = match_each_band(refined, fitted.map, model, options.band_model)
@@ -340,6 +339,9 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
 
     Too few patches leave what was found.
     """
+    from geodelreg.fine.settle import settle
+    from geodelreg.fit.field import facets_of, halves_apart, selection_of
+
     guess, refined, fitted = found
     with pair.timings("field"):
         settled = settle(refined, whole.field or fitted.map)

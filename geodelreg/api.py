@@ -28,12 +28,10 @@ from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
-from geodelreg.product.gcps.given import given_points
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
 from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.raster.reader import RasterReader, check_band, open_raster
-from geodelreg.refit_pair import refit_pair
 from geodelreg.second_look import align_rasters
 from geodelreg.values.result import CheckOutcome, Input, Solution
 from geodelreg.values.timings import Timings
@@ -239,6 +237,9 @@ def refit(
     GeodelregError
         Its other kinds, for bad input.
     """
+    from geodelreg.product.gcps.given import given_points
+    from geodelreg.refit_pair import refit_pair
+
     options, masks, pan_masks = _asked(options, knobs, mask, pan_mask)
     if snap and reference is None:
         raise UsageError("`snap=True` measures points on PAN, and none was given", "Name PAN.")
