@@ -50,17 +50,22 @@ def working_gsd_m(pair: Pair, scope: Scope) -> float:
     return max(*pair.source_gsd_m, *pair.reference_gsd_m, least)
 
 
+def overview_shapes(pair: Pair, scope: Scope) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(height, width) of both images of a scope at one ground sampling distance."""
+    gsd_m = working_gsd_m(pair, scope)
+    return (
+        _shape(scope.source, pair.source_gsd_m, gsd_m),
+        _shape(scope.reference, pair.reference_gsd_m, gsd_m),
+    )
+
+
 def read_overview(pair: Pair, scope: Scope) -> Overview:
     """Read both images of a scope at one ground sampling distance.
 
     Matching at the coarser of two resolutions costs a fraction of matching at the finer one, and
     finds more.
     """
-    gsd_m = working_gsd_m(pair, scope)
-    shapes = (
-        _shape(scope.source, pair.source_gsd_m, gsd_m),
-        _shape(scope.reference, pair.reference_gsd_m, gsd_m),
-    )
+    shapes = overview_shapes(pair, scope)
     with pair.timings("read"), ThreadPoolExecutor(1) as aside:
         source = aside.submit(pair.source.read, pair.source_bands, scope.source, shapes[0])
         reference = pair.reference.read([pair.options.pan_band], scope.reference, shapes[1])

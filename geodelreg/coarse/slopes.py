@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from geodelreg.coarse.correlation import detail_pair, masked_correlation
-from geodelreg.coarse.scopes import read_overview, scopes
+from geodelreg.coarse.scopes import overview_shapes, scopes
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.overlay import overlay
 from geodelreg.fine.surface import make_surface
@@ -172,15 +172,14 @@ def as_slopes(pair: Pair) -> Slopes | None:
         what it shows of PAN itself would displace the slopes.
     """
     scope = next(scopes(pair))
-    images = read_overview(pair, scope)
-    shape = images.reference.data.shape[0], images.reference.data.shape[1]
+    source_shape, shape = overview_shapes(pair, scope)
     view = Slopes(pair.reference, pair.pan_px_per_coarser_px)
     (slope,) = view.slopes([pair.options.pan_band], scope.reference, shape)
     ways = (slope.along((1.0, 0.0)), slope.along((0.0, 1.0)), slope.strength())
-    source = mean_band(images.source)
+    source = mean_band(pair.source.read(pair.source_bands, scope.source, source_shape))
     plain, x, y, edges = (
         _Beside.of(pair, source, look)
-        for look in (images.reference, *(_averaged(way, shape) for way in ways))
+        for look in (_averaged(way, shape) for way in (slope.of, *ways))
     )
     across, down, strength = (one.likeness() for one in (x, y, edges))
     shaded = np.hypot(across, down)
