@@ -50,6 +50,7 @@ def find_ground(
     target: FloatArray,
     variance_px2: FloatArray,
     brightest: FloatArray,
+    calm: bool = False,
 ) -> Ground:
     """Tell the ground from what moves differently.
 
@@ -66,12 +67,15 @@ def find_ground(
         Trace of the covariance of `target`.
     brightest : (N,) float64
         As for `geodelreg.fine.clouds.cloud_look`.
+    calm : bool
+        Nearly all patches are known to agree on a gentle field: none of them is a cloud's, whatever
+        part an affine explains and however bright the rest.
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
     core = consensus_affine(source, target, variance_px2, tolerance).inliers
     for still in (core, np.hypot(*(target - source).T) <= tolerance):
         look = cloud_look(source, ~still, brightest)
-        if look.explains:
+        if look.explains and not calm:
             return Ground(still, np.where(still, 0, -1).astype(np.intp), look)
     label = layers(source, target - source, np.sqrt(variance_px2))
     return Ground(label == 0, label, look)

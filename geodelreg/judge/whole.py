@@ -197,8 +197,9 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
         return _bent(refined, correction, agreed)
     at, move = places.centre[index], places.move[index]
     doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
-    ground = find_ground(at, at + move, doubt, places.brightest[index])
-    if ground.look.explains:
+    calm = refined.bend is not None
+    ground = find_ground(at, at + move, doubt, places.brightest[index], calm)
+    if ground.look.explains and not calm:
         return replace(agreed, clouds=float((~ground.member).mean()))
     to_full = ~part.template.grid.transform @ template.grid.transform
     unit = float(np.sqrt(abs(to_full.determinant)))
