@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -123,9 +124,14 @@ def run_case(case: Case, data: Path, maker: Executor) -> Row:
 _made: list[BentPair] = []
 
 
+@cache
+def _imagery(texture: str, data: Path) -> Imagery:
+    return TEXTURES[texture](data)
+
+
 def _make_in(case: Case, data: Path, folder: Path) -> None:
     """Write the rasters of a pair, and keep what is true of it for `_compared`."""
-    pair = make(case, TEXTURES[case.texture](data))
+    pair = make(case, _imagery(case.texture, data))
     write_scene(pair.scene, folder)
     _made[:] = [pair]
 
