@@ -21,6 +21,8 @@ from geodelreg.fine.matching import patches_log_nfa, tie_points
 from geodelreg.fine.motions import LEAST_SHARE
 from geodelreg.fine.passes import Refinement, refine, refine_proven
 from geodelreg.fit.choice import Fitted, half_disagreement, select_for
+from geodelreg.fit.estimate import student_weight
+from geodelreg.fit.field import facets_of, form_of, halves_apart, selection_of
 from geodelreg.fit.models import Frame, points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.geo.maps.field import FieldMap
@@ -201,7 +203,9 @@ def fit_patches(
     selection = select_for(pair, points)
     estimate = selection.estimate
     status[kept[~estimate.inlier]] = Status.RESIDUAL
-    tied = tie_points(part, last.matched, estimate.map, status)
+    weight = np.full(len(status), np.nan)
+    weight[kept] = student_weight(estimate.distance2)
+    tied = tie_points(part, last.matched, estimate.map, status, weight)
     halves = points.take(estimate.inlier)
     apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
     return Fitted(
@@ -287,6 +291,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         + notes,
         search=guess.search,
         bands=bands,
+        form=None if fitted.points.weight is None else form_of(fitted.selection.estimate),
     )
 
 
@@ -340,8 +345,6 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
     Too few patches leave what was found.
     """
     from geodelreg.fine.settle import settle
-    from geodelreg.fit.field import facets_of, halves_apart, selection_of
-
     guess, refined, fitted = found
     with pair.timings("field"):
         settled = settle(refined, whole.field or fitted.map)
@@ -351,7 +354,7 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         field: FieldMap | TinMap = fit.field
         if pair.options.model == "tin":
             field = facets_of(field.source, field.target, field.noise_px2)
-        tied = tie_points(refined.part, settled.matched, field, settled.status)
+        tied = tie_points(refined.part, settled.matched, field, settled.status, settled.weight)
         selection = selection_of(field, fit.distance2[fit.inlier], Frame.of(pair))
         apart_px = pair.pan_px_per_source_px * halves_apart(field)
         # a field follows its points: those that it has not seen say what chance would do

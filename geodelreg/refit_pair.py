@@ -11,12 +11,20 @@ import numpy as np
 
 from geodelreg.errors import PointsError
 from geodelreg.fine.snap import snap_points
-from geodelreg.fit.choice import Selection, select_for
-from geodelreg.fit.estimate import Observations, minimum_points
-from geodelreg.fit.field import FEWEST_POINTS, facets_of, fit_field, selection_of
+from geodelreg.fit.choice import Selection, select_again, select_for
+from geodelreg.fit.estimate import Observations, minimum_points, student_weight
+from geodelreg.fit.field import (
+    FEWEST_POINTS,
+    facets_of,
+    fit_again,
+    fit_field,
+    form_of,
+    selection_of,
+)
 from geodelreg.fit.jumps import cut_at_jumps
 from geodelreg.fit.models import Frame, design
 from geodelreg.geo.maps.field import FieldMap
+from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.accuracy import measure_points
 from geodelreg.judge.evidence import turn_and_scale
@@ -25,7 +33,7 @@ from geodelreg.judge.whole import largest_strain
 from geodelreg.judge.words import warnings_of
 from geodelreg.options import FOLLOWING, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, roles
-from geodelreg.values.points import GivenPoints, Status, TiePoints
+from geodelreg.values.points import FitForm, GivenPoints, Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
 from geodelreg.values.result import Solution
 from geodelreg.values.timings import Timings
@@ -46,6 +54,7 @@ class _Fit:
 
     selection: Selection
     used: BoolArray
+    weight: FloatArray
 
 
 def refit_pair(
@@ -90,8 +99,9 @@ def refit_pair(
     report(0.6, "fitting")
     with pair.timings("fit"):
         points, used = _observations(pair, given)
-        _check_enough(given, points, options.model)
-        fit = _fit(pair, given, points, used)
+        form = given.form if given.form and options.model in ("auto", given.form.model) else None
+        _check_enough(given, points, form.model if form else options.model)
+        fit = _fit(pair, given, points, used, form)
     report(1.0, "done")
     return pair, _conclude(pair, given, fit, notes, with_pan=reference is not None)
 
@@ -142,7 +152,9 @@ def _within(at: FloatArray, low: tuple[int, int], high: tuple[int, int]) -> Bool
 
 def _observations(pair: Pair, given: GivenPoints) -> tuple[Observations, BoolArray]:
     """Enabled points whose pixel is known; what is placed by hand counts as far as an eye sees."""
-    used = given.enabled & np.isfinite(given.source_px).all(axis=1)
+    # what a fit found too far has the little weight that it had, until someone says otherwise
+    far = (given.status == Status.RESIDUAL) & np.isfinite(given.weight)
+    used = (given.enabled | far) & np.isfinite(given.source_px).all(axis=1)
     covariance = given.covariance_px2[used]
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     sigma_px = _LEAST_PX
@@ -178,20 +190,42 @@ def _check_enough(given: GivenPoints, points: Observations, model: str) -> None:
         )
 
 
-def _fit(pair: Pair, given: GivenPoints, points: Observations, used: BoolArray) -> _Fit:
-    """The model asked for; only what it determines is left of the points used."""
-    selection = select_for(pair, points)
-    if pair.options.model == "field":
-        fit = cut_at_jumps(points, fit_field(points))
+def _fit(
+    pair: Pair,
+    given: GivenPoints,
+    points: Observations,
+    used: BoolArray,
+    form: FitForm | None,
+) -> _Fit:
+    """The model asked for, or that of the points' own fit; what it stands on of the points used.
+
+    Points keep the weights that they have from that fit, unless they were edited.
+    """
+    model = form.model if form else pair.options.model
+    weight = given.weight[used]
+    selection = (
+        select_again(model, points, Frame.of(pair), form.spread_px2, weight)
+        if form and model not in FOLLOWING
+        else select_for(pair, points)
+    )
+    if model == "field":
+        if form:
+            kernel = Kernel(form.range_px, form.variance_px2, form.spread_px2)
+            fit = fit_again(points, kernel, weight, form.jump_rows)
+        else:
+            fit = cut_at_jumps(points, fit_field(points))
         selection = selection_of(fit.field, fit.distance2[fit.inlier], Frame.of(pair))
-        inlier = fit.inlier
-    elif pair.options.model == "tin":
+        inlier, judged = fit.inlier, np.full(len(points), np.nan)
+        judged[inlier] = fit.weight
+    elif model == "tin":
         noise = points.covariance[:, (0, 1), (0, 1)]
         facets = facets_of(points.source, points.target, noise)
         selection = selection_of(facets, selection.estimate.distance2, Frame.of(pair))
         inlier = np.ones(len(points), dtype=np.bool_)
+        judged = np.ones(len(points))
     else:
         inlier = selection.estimate.inlier
+        judged = student_weight(selection.estimate.distance2)
     lattice = np.concatenate([pair.source_lattice(LATTICE), points.source])
     turned = np.linalg.det(selection.estimate.map.linearise(lattice)[:, :, :2])
     if not (turned > 0).all():
@@ -207,9 +241,9 @@ def _fit(pair: Pair, given: GivenPoints, points: Observations, used: BoolArray) 
             "large or small as its header says: they are those of another raster",
             "Name the raster that the points were made for, or allow it with `max_scale`.",
         )
-    kept = used.copy()
-    kept[used] = inlier
-    return _Fit(selection, kept)
+    kept, weights = used.copy(), np.full(len(given), np.nan)
+    kept[used], weights[used] = inlier, np.where(np.isfinite(weight), weight, judged)
+    return _Fit(selection, kept, weights)
 
 
 def _conclude(
@@ -235,6 +269,7 @@ def _conclude(
             *warnings_of(pair, model, points, matched=False),
         ),
         search="points",
+        form=form_of(fit.selection.estimate),
     )
 
 
@@ -248,7 +283,9 @@ def _tie_points(pair: Pair, given: GivenPoints, fit: _Fit) -> TiePoints:
     there = pair.to_reference(fit.selection.estimate.map)
     residual = np.full(reference.shape, np.nan)
     residual[known] = there.forward(given.source_px[known]) - reference[known]
-    return TiePoints(given.source_px, reference, covariance, given.score, status, residual)
+    return TiePoints(
+        given.source_px, reference, covariance, given.score, status, residual, fit.weight
+    )
 
 
 def _warnings(given: GivenPoints, points: TiePoints, sigma_px: float, with_pan: bool) -> list[str]:

@@ -23,7 +23,7 @@ from geodelreg.geo.maps.smooth import Inverse
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status, TiePoints
-from geodelreg.values.raster import StatusArray
+from geodelreg.values.raster import FloatArray, StatusArray
 
 _GROUP_PATCHES = 100  # unexplained: ablate
 _BAND_PATCHES = 100  # or a few more: the band's sigma is a tenth of a patch's
@@ -121,7 +121,11 @@ def observe(part: Roles, matched: Matched, correction: PixelMap) -> Observations
 
 
 def tie_points(
-    part: Roles, matched: Matched, correction: PixelMap, status: StatusArray
+    part: Roles,
+    matched: Matched,
+    correction: PixelMap,
+    status: StatusArray,
+    weight: FloatArray | None = None,
 ) -> TiePoints:
     """Patches as tie points between MS and PAN pixels, with residuals under a correction."""
     there = part.pair.to_reference(correction)
@@ -133,7 +137,7 @@ def tie_points(
         _, covariance = there.carry(source, matched.covariance_px2)
     residual = there.forward(source) - reference
     score = np.abs(matched.correlation)
-    return TiePoints(source, reference, covariance, score, status, residual)
+    return TiePoints(source, reference, covariance, score, status, residual, weight)
 
 
 def patches_log_nfa(part: Roles, points: TiePoints, sample_size: int) -> float:

@@ -75,6 +75,13 @@ class Settled:
         status[self.ground[~self.fit.inlier]] = Status.RESIDUAL
         return status
 
+    @property
+    def weight(self) -> FloatArray:
+        """(P,) of each patch in the fit; NaN of those that it does not stand on."""
+        weight = np.full(len(self.matched.status), np.nan)
+        weight[self.ground[self.fit.inlier]] = self.fit.weight
+        return weight
+
 
 def settle(refined: Refinement, start: PixelMap) -> Settled | None:
     """Match and fit in turn until the next pass would move the field by less than it is uncertain.

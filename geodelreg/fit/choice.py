@@ -198,6 +198,14 @@ def select_model(
     return Selection(full, check_full, neglected)
 
 
+def select_again(
+    model: str, points: Observations, frame: Frame, spread_px2: float, weight: FloatArray
+) -> Selection:
+    """The fit that gave points their weights, with others (NaN) beside them."""
+    estimate = robust_fit(model, points, frame, spread_px2, weight)
+    return Selection(estimate, held_out(model, points, estimate))
+
+
 def select_for(pair: Pair, points: Observations) -> Selection:
     """`select_model` as the options of a pair ask; what follows a bend starts from an affine.
 

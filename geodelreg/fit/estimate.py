@@ -131,7 +131,11 @@ def _solve(
 
 
 def robust_fit(
-    model: str, points: Observations, frame: Frame, extra_variance_px2: float | None = None
+    model: str,
+    points: Observations,
+    frame: Frame,
+    extra_variance_px2: float | None = None,
+    known: FloatArray | None = None,
 ) -> Estimate:
     """Fit by iteratively reweighted least squares with Student weights.
 
@@ -146,6 +150,8 @@ def robust_fit(
     frame : Frame
     extra_variance_px2 : float, optional
         Take this common variance instead of estimating it.
+    known : (N,) float64, optional
+        Student weights of a fit before, to be taken as they are; NaN of points to be judged.
 
     Returns
     -------
@@ -161,7 +167,8 @@ def robust_fit(
     extra = extra_variance_px2 or 0.0
     variances, axes = np.linalg.eigh(points.covariance)
     columns, right = _system(model, points, frame)
-    student = np.ones(len(points))
+    known = np.full(len(points), np.nan) if known is None else known
+    student = np.where(np.isfinite(known), known, 1.0)
     previous = None
     for number in range(_MOST_ROUNDS):
         inverse = _inverse(points.covariance, extra)
@@ -173,7 +180,7 @@ def robust_fit(
             extra = _variance_left(residual, variances, axes)
             inverse = _inverse(points.covariance, extra)
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
-        student = student_weight(distance2)
+        student = np.where(np.isfinite(known), known, student_weight(distance2))
         if previous is not None and np.abs(parameters - previous).max() < _CONVERGED:
             break
         previous = parameters

@@ -16,6 +16,7 @@ from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel, distances, solve_axis
 from geodelreg.geo.maps.tin import TinMap
+from geodelreg.values.points import FitForm
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 FEWEST_POINTS = 12
@@ -90,10 +91,7 @@ def fit_field(
         kept = points.take(inlier)
         if number == 0 or start is None:
             kernel = tuned(kept, kernel, weight[inlier], jumps).kernel
-        field = field_of(kept, kernel, weight[inlier], jumps)
-        residual, variance = field.left_out()
-        own = np.stack([kept.covariance[:, i, i] + kernel.nugget_px2 for i in (0, 1)], axis=1)
-        distance2[inlier] = (residual**2 / (variance + own)).sum(axis=1)
+        distance2[inlier] = _unlike(field_of(kept, kernel, weight[inlier], jumps), kept)
         weight = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
         enough = distance2 <= _REJECT_D2
         if (inlier & enough).sum() < FEWEST_POINTS:
@@ -101,6 +99,46 @@ def fit_field(
         inlier = inlier & enough
     field = field_of(points.take(inlier), kernel, weight[inlier], jumps)
     return FieldFit(field, weight[inlier], inlier, distance2)
+
+
+def fit_again(
+    points: Observations, kernel: Kernel, weight: FloatArray, jumps: tuple[float, ...]
+) -> FieldFit:
+    """The fit that gave points their weights, with others beside them.
+
+    Parameters
+    ----------
+    points : Observations
+    kernel : Kernel
+    weight : (N,) float64
+        NaN of the others: they are judged by what all predict.
+    jumps : tuple of float
+    """
+    before, weight = np.isfinite(weight), np.where(np.isfinite(weight), weight, 1.0)
+    field = field_of(points, kernel, weight, jumps)
+    distance2 = _unlike(field, points)
+    inlier = before | (distance2 <= _REJECT_D2)
+    if not inlier.all():
+        field = field_of(points.take(inlier), kernel, weight[inlier], jumps)
+    return FieldFit(field, weight[inlier], inlier, distance2)
+
+
+def _unlike(field: FieldMap, points: Observations) -> FloatArray:
+    """(N,) squared distance of a field's points from what the others predict, in variances."""
+    residual, variance = field.left_out()
+    own = points.covariance[:, (0, 1), (0, 1)] + field.kernel.nugget_px2
+    return np.asarray((residual**2 / (variance + own)).sum(axis=1))
+
+
+def form_of(estimate: Estimate) -> FitForm:
+    """What a fit has beside its points."""
+    field = estimate.map
+    if not isinstance(field, FieldMap):
+        return FitForm(estimate.model, estimate.extra_variance_px2)
+    kernel = field.kernel
+    return FitForm(
+        estimate.model, kernel.nugget_px2, kernel.range_px, kernel.variance_px2, field.jumps
+    )
 
 
 def field_of(

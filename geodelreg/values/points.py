@@ -112,6 +112,8 @@ class TiePoints:
         `Status` code; 0 = kept.
     residual_px : (M, 2) float64
         Corrected source position minus reference, in PAN pixels; NaN before the fit.
+    weight : (M,) float64, optional
+        By which the fit divided a point's variance; NaN of points that it was not given.
     """
 
     source_px: FloatArray
@@ -120,6 +122,7 @@ class TiePoints:
     score: FloatArray
     status: StatusArray
     residual_px: FloatArray
+    weight: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.source_px)
@@ -146,6 +149,30 @@ NO_TIE_POINTS = TiePoints(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class FitForm:
+    """What a fit has beside its points: with it and their weights the same map comes out again.
+
+    Attributes
+    ----------
+    model : str
+    spread_px2 : float
+        Variance per axis that every point has besides its own, MS pixels squared.
+    range_px : float
+        Of a field: distance scale of its correlation, MS pixels.
+    variance_px2 : (float, float)
+        Of a field: variance of the residual along columns and rows.
+    jump_rows : tuple of float
+        Of a field: where it is cut.
+    """
+
+    model: str
+    spread_px2: float
+    range_px: float = 0.0
+    variance_px2: tuple[float, float] = (0.0, 0.0)
+    jump_rows: tuple[float, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenPoints:
     """Points out of a file that a person may have edited, in MS pixels.
@@ -166,6 +193,10 @@ class GivenPoints:
     enabled : (N,) bool
     status : (N,) uint8
         Why those that are not enabled are not.
+    weight : (N,) float64
+        In the fit that they come from; NaN of points that it was not given, or that were edited.
+    form : FitForm or None
+        Of that fit, where the file tells.
     """
 
     file: str
@@ -176,6 +207,8 @@ class GivenPoints:
     score: FloatArray
     enabled: BoolArray
     status: StatusArray
+    weight: FloatArray
+    form: FitForm | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -186,6 +219,7 @@ class Gcp:
     """A ground control point: MS pixel (outer corner) ↔ map coordinates in the MS CRS.
 
     `facts` are its numbers by name, for formats that have fields; a rejected one is not `enabled`.
+    `form` is that of the fit it comes from, where one is known.
     """
 
     id: str
@@ -197,6 +231,7 @@ class Gcp:
     info: str = ""
     enabled: bool = True
     facts: tuple[tuple[str, float | None], ...] = ()
+    form: FitForm | None = None
 
 
 def _nowhere() -> FloatArray:

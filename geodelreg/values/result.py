@@ -12,7 +12,7 @@ from affine import Affine
 from geodelreg.masking import MaskUse
 from geodelreg.options import AlignOptions
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import TiePoints
+from geodelreg.values.points import FitForm, TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.remedies import remedy_for
 
@@ -238,6 +238,8 @@ class Solution:
         Which search led to it: ``header``, ``keypoints``, ``whole``; ``none`` when none did.
     bands : tuple of BandMap
         With ``per_band`` those of the bands that show enough by themselves, else none.
+    form : FitForm or None
+        With which the weighted tie points give `map` again; None where they do not.
     """
 
     model: str
@@ -250,6 +252,7 @@ class Solution:
     warnings: tuple[str, ...] = ()
     search: str = "none"
     bands: tuple[BandMap, ...] = ()
+    form: FitForm | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from benchmarks.scenes.truth import check_points
 from geodelreg import Alignment, AlignOptions, WriteOptions
 from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.geo.maps.field import FieldMap
+from geodelreg.product.gcps import gcp_context, gcps_from_alignment, write_gcps
 from geodelreg.product.report import report_dict, report_schema
 from geodelreg_cli.main import cli
 
@@ -115,6 +116,47 @@ def test_the_report_holds_the_map_itself(followed: Alignment) -> None:
     at = check_points((300, 300))
     assert np.abs(again.forward(at) - followed.solution.map.forward(at)).max() < 1e-9
     assert np.abs(again.sigma_at(at) - followed.solution.map.sigma_at(at)).max() < 1e-9
+
+
+def exported(alignment: Alignment, path: Path) -> Path:
+    """All its points, the rejected ones too."""
+    points = gcps_from_alignment(alignment, every=True)
+    write_gcps(path, points, context=gcp_context(alignment, every=True))
+    return path
+
+
+@pytest.mark.parametrize("name", ["all.geojson", "all.gpkg", "all.fgb"])
+def test_unedited_points_give_the_field_again(
+    wavy: Made, followed: Alignment, tmp_path: Path, name: str
+) -> None:
+    at = np.random.default_rng(1).uniform(-20, 320, (500, 2))
+    true = followed.solution.map
+    points = exported(followed, tmp_path / name)
+    for model in ("auto", "field"):
+        again = geodelreg.refit(points, wavy.ms, wavy.pan, model=model).solution
+        assert again.model == "field"
+        assert np.abs(again.map.forward(at) - true.forward(at)).max() < 1e-6
+        assert np.abs(again.map.sigma_at(at) - true.sigma_at(at)).max() < 1e-6
+    affine = geodelreg.refit(points, wavy.ms, wavy.pan, model="affine").solution
+    assert rms(affine.map.forward(at) - true.forward(at)) > 0.3
+
+
+def test_an_edit_moves_the_field_there_alone(
+    wavy: Made, followed: Alignment, tmp_path: Path
+) -> None:
+    layer = exported(followed, tmp_path / "all.geojson")
+    document = json.loads(layer.read_text("utf-8"))
+    told = [f["properties"] for f in document["features"] if f["properties"]["enable"]]
+    edited = min(told, key=lambda point: np.hypot(point["row"] - 150, point["col"] - 150))
+    edited["x"] += 10.0
+    edited["sigma_x"] = edited["sigma_y"] = None
+    layer.write_text(json.dumps(document), "utf-8")
+    after = geodelreg.refit(layer, wavy.ms, wavy.pan).solution
+    at = np.array([(point["col"], point["row"]) for point in told])
+    gap = np.hypot(*(after.map.forward(at) - followed.solution.map.forward(at)).T)
+    away = np.hypot(*(at - (edited["col"], edited["row"])).T)
+    assert 0 < gap[away < 1].max() < 0.5
+    assert gap[away > 100].max() < 0.1 * gap[away < 1].max()
 
 
 def test_the_command_warps_it_onto_the_grid_of_pan(wavy: Made, tmp_path: Path) -> None:

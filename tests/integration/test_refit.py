@@ -321,6 +321,9 @@ def test_a_scale_that_no_header_is_wrong_by_is_refused(tmp_path: Path) -> None:
     assert found.at_centre.scale[0] == pytest.approx(2.5, abs=0.01)
 
 
+FORM = {
+    "model": "affine", "spread_px2": 0.0, "range_px": 0.0, "variance_px2": [0, 0], "jump_rows": []
+}  # fmt: skip
 BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] = {
     "on a line": (
         lambda: rows_at([(float(i), 2.0 * i) for i in range(5, 60, 5)], truly), (), "on a line"
@@ -348,6 +351,24 @@ BAD: dict[str, tuple[Callable[[], list[dict[str, Any]]], tuple[str, ...], str]] 
     ),
     "words for numbers": (
         lambda: [row | {"enable": "yes"} for row in rows_at(SPREAD, truly)], (), "'yes' is no"
+    ),
+    "no fit": (
+        lambda: [row | {"fit": '{"model": "field"}'} for row in rows_at(SPREAD, truly)], (),
+        "its fit cannot be read",
+    ),
+    "two fits": (
+        lambda: [
+            row | {"fit": json.dumps(FORM | {"spread_px2": n % 2})}
+            for n, row in enumerate(rows_at(SPREAD, truly))
+        ],
+        (), "come from 2 fits",
+    ),
+    "a kernel that is none": (
+        lambda: [
+            row | {"fit": json.dumps(FORM | {"model": "field", "range_px": -1.0})}
+            for row in rows_at(SPREAD, truly)
+        ],
+        (), "its fit cannot be read",
     ),
     "an error below 0": (
         lambda: [row | {"sigma_x": -1, "sigma_y": 1} for row in rows_at(SPREAD, truly)], (),

@@ -129,6 +129,7 @@ def gcps_from_alignment(
             info=info,
             enabled=enabled,
             facts=facts,
+            form=alignment.solution.form,
         )
         for number, ((column, row), (x, y), info, enabled, facts) in enumerate(
             zip(

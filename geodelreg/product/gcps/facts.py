@@ -1,14 +1,16 @@
 """Numbers of a control point beside its place: written where a format has fields, and read back.
 
 Lengths that end in ``_px`` are PAN pixels.  `SIGMA_X`, `SIGMA_Y` (units of the map) and
-`ERROR_CORRELATION` are the covariance of the map position: with them a fit weighs the points anew.
+`ERROR_CORRELATION` are the covariance of the map position: with them a fit weighs the points anew,
+and with `WEIGHT` and `FIT` as it did.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,8 @@ from geodelreg.errors import GcpFormatError
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
-from geodelreg.values.points import Gcp
+from geodelreg.options import MODELS
+from geodelreg.values.points import FitForm, Gcp
 from geodelreg.values.raster import FloatArray, Grid, IntArray
 from geodelreg.values.result import Alignment
 
@@ -26,9 +29,12 @@ SIGMA_X, SIGMA_Y, ERROR_CORRELATION = "sigma_x", "sigma_y", "error_correlation"
 HEADER = ("header_x", "header_y")
 """Map position of the pixel by the original header: of which raster the point is."""
 COVARIANCE = (SIGMA_X, SIGMA_Y, ERROR_CORRELATION)
+WEIGHT, FIT = "weight", "fit"
+MEASURED = (*COVARIANCE, WEIGHT)
+"""What no longer holds of a point that was moved."""
 NAMES = (
     STATUS, BAND, "residual_right_px", "residual_down_px", "sigma_right_px", "sigma_down_px",
-    "correlation", *COVARIANCE, *HEADER,
+    "correlation", *MEASURED, *HEADER,
 )  # fmt: skip
 Facts = tuple[tuple[str, float | None], ...]
 
@@ -42,10 +48,11 @@ def facts_of(alignment: Alignment, order: IntArray) -> list[Facts]:
             alignment.source.grid, alignment.reference.grid,
         )
     )  # fmt: skip
+    weight = np.full(len(points), np.nan) if points.weight is None else points.weight
     rows = np.column_stack(
         [
             points.status[order], np.zeros(len(order)), points.residual_px[order],
-            points.sigma_px[order], points.score[order], sigma,
+            points.sigma_px[order], points.score[order], sigma, weight[order],
             apply_affine(alignment.source.grid.transform, points.source_px[order]),
         ]
     )  # fmt: skip
@@ -70,10 +77,10 @@ def of_bands(alignment: Alignment, gcps: Sequence[Gcp]) -> tuple[Gcp, ...]:
         pixels = band.map.inverse(header_px)
         places = apply_affine(alignment.source.grid.transform, pixels)
         for gcp, (column, row), (x, y) in zip(gcps, pixels.tolist(), places.tolist(), strict=True):
-            known = dict(gcp.facts) | {BAND: float(band.number)}
+            known = dict(gcp.facts) | {BAND: float(band.number), WEIGHT: None}
             facts = tuple((known | dict(zip(HEADER, (x, y), strict=True))).items())
             name = f"{gcp.id}b{band.number}"
-            found.append(replace(gcp, id=name, column=column, row=row, facts=facts))
+            found.append(replace(gcp, id=name, column=column, row=row, facts=facts, form=None))
     return tuple(found)
 
 
@@ -136,9 +143,40 @@ def read_facts(fields: Mapping[str, Any], where: str) -> tuple[Facts, bool]:
     return tuple(found.items()), enabled
 
 
-def fields_of(gcp: Gcp) -> dict[str, float | None]:
-    """Enabled flag and facts to write; none of a point of which nothing more is known."""
-    return {ENABLE: int(gcp.enabled), **dict(gcp.facts)} if gcp.facts else {}
+def fields_of(gcp: Gcp) -> dict[str, float | str | None]:
+    """Enabled flag, facts and fit to write; none of a point of which nothing more is known."""
+    if not gcp.facts:
+        return {}
+    form = {} if gcp.form is None else {FIT: json.dumps(asdict(gcp.form), allow_nan=False)}
+    return {ENABLE: int(gcp.enabled), **dict(gcp.facts), **form}
+
+
+def form_of(text: Any, where: str) -> FitForm | None:
+    """The fit that a field of a point tells of; None of an empty one.
+
+    Raises
+    ------
+    GcpFormatError
+        It tells of none.
+    """
+    if text is None or text == "":
+        return None
+    try:
+        said = json.loads(text)
+        one, other = said["variance_px2"]
+        rows = tuple(float(row) for row in said["jump_rows"])
+        spread, reach = float(said["spread_px2"]), float(said["range_px"])
+        form = FitForm(str(said["model"]), spread, reach, (float(one), float(other)), rows)
+        known = form.model in MODELS[1:] and spread >= 0 and rows == tuple(sorted(set(rows)))
+        field = form.model != "field" or (reach > 0 and min(form.variance_px2) > 0)
+        if not (known and field and all(map(math.isfinite, (spread, reach, one, other, *rows)))):
+            raise ValueError(f"a {form.model} of such numbers")
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise GcpFormatError(
+            f"{where}: its {FIT} cannot be read ({error})",
+            f"Leave {FIT} as it was exported, or empty it: the points are then fitted anew.",
+        ) from error
+    return form
 
 
 def _number(value: Any, where: str) -> float | None:

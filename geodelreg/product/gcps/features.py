@@ -11,7 +11,7 @@ import numpy as np
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.crs import map_points
 from geodelreg.product.gcps.context import Decoded, GcpContext, crs_wkt_of, numbers
-from geodelreg.product.gcps.facts import COVARIANCE, ENABLE, fields_of, read_facts
+from geodelreg.product.gcps.facts import ENABLE, FIT, MEASURED, fields_of, form_of, read_facts
 from geodelreg.values.points import Gcp
 from geodelreg.values.raster import FloatArray
 
@@ -81,7 +81,7 @@ def _gcp(fields: Mapping[str, Any], place: list[float], moved: bool, index: int)
     drawn = "x" in missing or "y" in missing
     if drawn or (placed and moved and fields.get(ENABLE) is not None):
         x, y = place
-        facts = tuple((name, value) for name, value in facts if name not in COVARIANCE)
+        facts = tuple((name, value) for name, value in facts if name not in MEASURED)
     else:
         x, y = numbers([str(fields["x"]), str(fields["y"])], index)
     column = row = math.nan
@@ -89,4 +89,5 @@ def _gcp(fields: Mapping[str, Any], place: list[float], moved: bool, index: int)
         column, row = numbers([str(fields["col"]), str(fields["row"])], index)
     z = numbers([str(fields.get("z") or 0.0)], index)[0]
     name, info = fields.get("id"), str(fields.get("info") or "")
-    return Gcp(str(name or index), column, row, x, y, z, info, enabled, facts)
+    form = form_of(fields.get(FIT), f"feature {index}")
+    return Gcp(str(name or index), column, row, x, y, z, info, enabled, facts, form)

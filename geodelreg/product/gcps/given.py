@@ -11,7 +11,7 @@ import numpy as np
 from geodelreg.errors import PointsError
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.product.gcps.context import GcpContext, ground_of, pixels_of
-from geodelreg.product.gcps.facts import COVARIANCE, HEADER, STATUS, band_of, covariance_of
+from geodelreg.product.gcps.facts import HEADER, MEASURED, STATUS, WEIGHT, band_of, covariance_of
 from geodelreg.values.points import Gcp, GivenPoints, Status
 from geodelreg.values.raster import Grid
 
@@ -58,6 +58,15 @@ def given_points(
     score = np.array([fact.get("correlation") for fact in facts], dtype=np.float64)
     enabled = np.array([gcp.enabled for gcp in gcps])
     rejected = [int(fact.get(STATUS) or 0) for fact in facts]
+    weight = np.array([fact.get(WEIGHT) for fact in facts], dtype=np.float64)
+    weight[~((weight > 0) & np.isfinite(covariance).all(axis=(1, 2)))] = np.nan
+    weight[enabled != (np.array(rejected) == Status.KEPT)] = np.nan
+    forms = {gcp.form for gcp in gcps if gcp.form is not None}
+    if len(forms) > 1:
+        raise PointsError(
+            f"{path}: its points come from {len(forms)} fits",
+            "Empty the field fit: they are then fitted anew.",
+        )
     status = [code if code in set(Status) and code else int(Status.EXCLUDED) for code in rejected]
     return GivenPoints(
         str(path),
@@ -68,6 +77,8 @@ def given_points(
         score,
         enabled,
         np.array(status, dtype=np.uint8),
+        weight,
+        forms.pop() if forms else None,
     )
 
 
@@ -90,7 +101,7 @@ def _of_raster(path: Path, gcps: Sequence[Gcp], source: Grid) -> tuple[Gcp, ...]
             "Name the raster that the points were made for, with its original header.",
         )
     return tuple(
-        replace(gcp, facts=tuple(fact for fact in gcp.facts if fact[0] not in COVARIANCE))
+        replace(gcp, facts=tuple(fact for fact in gcp.facts if fact[0] not in MEASURED))
         if moved
         else gcp
         for gcp, moved in zip(gcps, elsewhere.tolist(), strict=True)

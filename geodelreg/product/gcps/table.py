@@ -12,7 +12,7 @@ from pathlib import Path
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.product.gcps.context import Decoded, GcpContext, exact, numbers
-from geodelreg.product.gcps.facts import fields_of, read_facts
+from geodelreg.product.gcps.facts import FIT, fields_of, form_of, read_facts
 from geodelreg.values.points import Gcp
 
 _FIELDS = ("id", "info", "column", "line", "x", "y", "z")
@@ -29,7 +29,7 @@ def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
     for gcp, fields in zip(gcps, known, strict=True):
         values = (gcp.column, gcp.row, gcp.x, gcp.y, gcp.z)
         facts = (fields.get(name) for name in more)
-        texts = ("" if value is None else repr(value) for value in facts)
+        texts = (v if isinstance(v, str) else "" if v is None else repr(v) for v in facts)
         writer.writerow((gcp.id, gcp.info, *map(exact, values), *texts))
     return buffer.getvalue()
 
@@ -61,6 +61,8 @@ def _decoded(reader: csv.DictReader[str]) -> Decoded:
         column, line, x, y = numbers([row[name] for name in _REQUIRED], reader.line_num)
         z = numbers([row["z"]], reader.line_num)[0] if row.get("z") else 0.0
         name, info = row.get("id") or str(index), row.get("info", "")
-        facts, enabled = read_facts(row, f"line {reader.line_num}")
-        gcps.append(Gcp(name, column, line, x, y, z, info, enabled, facts))
+        where = f"line {reader.line_num}"
+        facts, enabled = read_facts(row, where)
+        form = form_of(row.get(FIT), where)
+        gcps.append(Gcp(name, column, line, x, y, z, info, enabled, facts, form))
     return tuple(gcps), None

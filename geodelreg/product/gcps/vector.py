@@ -17,12 +17,12 @@ from geodelreg.door.names import LOCAL
 from geodelreg.door.vectors import check_vector
 from geodelreg.errors import GcpFormatError, MissingExtraError, RasterUnreadableError
 from geodelreg.product.gcps.context import Decoded, GcpContext, crs_name, ground_of
-from geodelreg.product.gcps.facts import ENABLE, STATUS
+from geodelreg.product.gcps.facts import ENABLE, FIT, STATUS
 from geodelreg.product.gcps.features import fields_of_gcp, gcps_of
 from geodelreg.values.points import Gcp
 
 _LAYER = "points"
-_TEXTS, _WHOLE = ("id", "info", "crs"), (ENABLE, STATUS)
+_TEXTS, _WHOLE = ("id", "info", "crs", FIT), (ENABLE, STATUS)
 _ROUNDING = 1e-9  # of a coordinate: millimetres, which changes of CRS there and back stay below
 _DATE = {"OGR_CURRENT_DATE": "1970-01-01T00:00:00Z"}  # the same points are the same bytes
 
