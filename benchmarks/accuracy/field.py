@@ -90,16 +90,8 @@ def make(case: Case, imagery: Imagery) -> BentPair:
     return BentPair(make_scene(spec, imagery, bend), bend)
 
 
-def run_case(case: Case, data: Path, maker: Executor) -> Row:
-    """Make one pair, align it in a process of its own, and compare with the truth.
-
-    Parameters
-    ----------
-    case : Case
-    data : Path
-        Folder with the real imagery.
-    maker : Executor
-        Of one process: what is made there does not count as the command's peak.
+def run_case(case: Case, pair: BentPair) -> Row:
+    """Align one pair in a process of its own, and compare with the truth.
 
     Returns
     -------
@@ -108,17 +100,29 @@ def run_case(case: Case, data: Path, maker: Executor) -> Row:
         ``cpu_s`` and ``peak_mb`` of the command, which writes its report and no raster.
     """
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        maker.submit(_make_in, case, data, folder).result()
-        command = [
-            sys.executable, "-m", "geodelreg_cli", "align", "ms.tif", "pan.tif", "--dry-run",
-            "--on-local", "field", "--max-residual", str(MOST_LEFT_PX), "--report", "out.json",
-            "--quiet",
-        ]  # fmt: skip
-        usage = measured(command, own_environment(), _TIMEOUT_S, folder)
-        found = json.loads((folder / "out.json").read_text("utf-8"))
-    cost = {"seconds": usage.wall_s, "cpu_s": usage.cpu_s, "peak_mb": usage.peak_mb}
-    return maker.submit(_compared, case, found).result() | cost
+        write_scene(pair.scene, Path(name))
+        found, cost = _aligned(Path(name))
+    return compared(case, pair, found) | cost
+
+
+def _small_run(case: Case, data: Path, maker: Executor) -> Row:
+    """`run_case`, with the pair in another process: what is made here would count as the peak."""
+    with tempfile.TemporaryDirectory() as name:
+        maker.submit(_make_in, case, data, Path(name)).result()
+        found, cost = _aligned(Path(name))
+    return maker.submit(_compared_there, case, found).result() | cost
+
+
+def _aligned(folder: Path) -> tuple[dict[str, Any], Row]:
+    """The report of a pair, and what it cost."""
+    command = [
+        sys.executable, "-m", "geodelreg_cli", "align", "ms.tif", "pan.tif", "--dry-run",
+        "--on-local", "field", "--max-residual", str(MOST_LEFT_PX), "--report", "out.json",
+        "--quiet",
+    ]  # fmt: skip
+    usage = measured(command, own_environment(), _TIMEOUT_S, folder)
+    found = json.loads((folder / "out.json").read_text("utf-8"))
+    return found, {"seconds": usage.wall_s, "cpu_s": usage.cpu_s, "peak_mb": usage.peak_mb}
 
 
 _made: list[BentPair] = []
@@ -130,17 +134,20 @@ def _imagery(texture: str, data: Path) -> Imagery:
 
 
 def _make_in(case: Case, data: Path, folder: Path) -> None:
-    """Write the rasters of a pair, and keep what is true of it for `_compared`."""
+    """Write the rasters of a pair, and keep what is true of it for `_compared_there`."""
     pair = make(case, _imagery(case.texture, data))
     write_scene(pair.scene, folder)
     _made[:] = [pair]
 
 
-def _compared(case: Case, found: dict[str, Any]) -> Row:
-    """A report against what is true of the pair that was made last."""
+def _compared_there(case: Case, found: dict[str, Any]) -> Row:
+    return compared(case, _made[0], found)
+
+
+def compared(case: Case, pair: BentPair, found: dict[str, Any]) -> Row:
+    """A report against the truth."""
     from geodelreg.geo.maps.field import FieldMap
 
-    pair = _made[0]
     at = check_points(pair.scene.truth.ms_shape)
     true = pair.pan_px(at)
     row: Row = {
@@ -230,7 +237,7 @@ def run(args: argparse.Namespace) -> int:
         for case in cases():
             if args.only not in case.name:
                 continue
-            rows.append(run_case(case, args.data.resolve(), maker))
+            rows.append(_small_run(case, args.data.resolve(), maker))
             print(table(rows[-1:]).splitlines()[-1], flush=True)
     waved = [row["rmse_px"] for row in rows if "rmse_px" in row]
     text = table(rows)
