@@ -60,6 +60,8 @@ _MINORITY = 0.4
 breaks down at half, and patches at the edge of what shows something hold some of the rest."""
 _GENTLE = 4.0
 """Patches within which a field varies: waves 7.5 patches long give 4.3, banks of clouds below 2."""
+_WITHIN_REACH = 0.6
+"""Share of the textured patches: the affine of one part of waves leaves a third of them too far."""
 _BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.tuning` that is not usual
 
 
@@ -245,15 +247,15 @@ def _of_the_ground(
 
 
 def _calm_bend(found: Refinement) -> Kernel | None:
-    """How a field varies on which nearly all textured patches agree to within their own noise.
+    """How a field varies on which nearly all patches that match agree to within their own noise.
 
     Clouds have edges that are no rows: a field that follows them bends from patch to patch, or
     leaves them out.
     """
     last = found.last
     matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
-    most = CALM_PATCHES * (last.status != Status.TEXTURE).sum()
-    if not found.part.pair.may_bend or len(matched) <= max(most, FEWEST_POINTS):
+    least = _WITHIN_REACH * (last.status != Status.TEXTURE).sum()
+    if not found.part.pair.may_bend or len(matched) <= max(least, FEWEST_POINTS):
         return None
     points = last.points.take(matched)
     if not np.ptp(points.source, axis=0).min() > 0:
