@@ -35,6 +35,7 @@ COMMANDS = {
         "sharpened ramps: every pixel in its place",
     ),
     "sharpen": ("benchmarks.sharpening.large", "a large pair: GDAL's tools beside it, dask"),
+    "warp": ("benchmarks.scale.warp", "MS warped onto PAN's grid, gdalwarp beside it"),
     "batch": ("benchmarks.batch.run", "many pairs: throughput, Dask, kills, a huge manifest"),
     "browser": ("benchmarks.browser.run", "the pages of reports in headless Chromium"),
     "filters": ("benchmarks.accuracy.filters", "mismatch filters against known truth"),
