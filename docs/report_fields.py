@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from geodelreg.options import AlignOptions, knob_help
+from geodelreg.option_checks import knob_help
+from geodelreg.options import AlignOptions
 from geodelreg.product.report import report_schema
 
 NO_NAME = {

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from geodelreg.alignment import Alignment
     from geodelreg.api import align, check, refit
     from geodelreg.applying import apply
-    from geodelreg.options import AlignOptions, PansharpenOptions, WriteOptions
+    from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.check import Check
     from geodelreg.report.output import write_report
     from geodelreg.sharpen import pansharpen
+    from geodelreg.sharpen_options import PansharpenOptions
     from geodelreg.values.raster import Grid
     from geodelreg.writing import (
         export_gcps,
@@ -56,7 +57,7 @@ _HOMES = {
     "Alignment": "geodelreg.alignment",
     "Check": "geodelreg.product.check",
     "Grid": "geodelreg.values.raster",
-    "PansharpenOptions": "geodelreg.options",
+    "PansharpenOptions": "geodelreg.sharpen_options",
     "WriteOptions": "geodelreg.options",
     "align": "geodelreg.api",
     "apply": "geodelreg.applying",

@@ -84,6 +84,8 @@ def _open(
                 )
             if options.band:
                 check_band(ms, options.band)
+            for number in options.agreeing_bands:
+                check_band(ms, number)
             check_band(pan, options.pan_band)
             fill = ms.leave_out(options.ms_nodata), pan.leave_out(options.pan_nodata)
         for role, reader in (("MS", ms), ("PAN", pan)):

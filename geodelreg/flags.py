@@ -13,11 +13,13 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import fields
 
-from geodelreg.options import AlignOptions, BatchOptions, PansharpenOptions, WriteOptions
+from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
+from geodelreg.sharpen_options import PansharpenOptions
 
 UNITS = {"_px": "PX", "_deg": "DEG", "_s": "S", "_mb": "MB"}
 FLAGS = {
     "band": ("-b", "--band"),
+    "agreeing_bands": ("--bands",),
     "masks": ("--mask",),
     "pan_masks": ("--pan-mask",),
     "ms_nodata": ("--nodata",),

@@ -15,6 +15,7 @@ class AlignKnobs(TypedDict, total=False):
     band: int | None
     per_band: bool
     band_model: str
+    agreeing_bands: tuple[int, ...]
     pan_band: int
     masks: tuple[str, ...]
     pan_masks: tuple[str, ...]

@@ -8,17 +8,29 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import Field, fields
+from dataclasses import Field, field, fields
 from numbers import Integral, Real
 from typing import Any
 
 from geodelreg.errors import UsageError
 from geodelreg.masking import parse_mask
 
+RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
+
+
+def knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
+    """A field of options with its documentation."""
+    return field(default=default, metadata={"help": help_text, "choices": choices})
+
 
 def field_of(options: Any, name: str) -> Field[Any]:
     """One field of options, or of their class."""
     return {field.name: field for field in fields(options)}[name]
+
+
+def knob_help(options: type, name: str) -> str:
+    """Help text of one knob of an options class."""
+    return str(field_of(options, name).metadata["help"])
 
 
 def check_choice(options: object, name: str) -> None:
@@ -66,6 +78,31 @@ def keep_list(options: object, name: str) -> None:
             object.__setattr__(options, name, tuple(value))
         except TypeError:
             raise TypeError(f"`{name}={value!r}` is neither text nor numbers") from None
+
+
+def listed(value: str | Iterable[Any]) -> list[Any]:
+    """The parts of a sequence, or of text with commas."""
+    return value.split(",") if isinstance(value, str) else list(value)
+
+
+def band_numbers(name: str, value: str | Iterable[Any]) -> tuple[int, ...]:
+    """Numbers of bands, from 1, out of a sequence or text with commas."""
+    texts = [str(each).strip() for each in listed(value)]
+    if not all(text.isdecimal() and int(text) > 0 for text in texts):
+        raise UsageError(f"`{name}={value!r}` are no bands", "Use numbers such as 1,2,3.")
+    return tuple(int(text) for text in texts)
+
+
+def keep_bands(options: object, name: str) -> None:
+    """Keep numbers of two bands or more, or of none, as a tuple."""
+    value = getattr(options, name)
+    try:
+        numbers = band_numbers(name, value) if value else ()
+    except TypeError:
+        raise TypeError(f"`{name}={value!r}` is neither text nor numbers") from None
+    if len(numbers) == 1:
+        raise UsageError(f"`{name}={value!r}` is one band", "Name two or more.")
+    object.__setattr__(options, name, numbers)
 
 
 def check_range(options: object, name: str, low: float, high: float) -> None:

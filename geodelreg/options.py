@@ -5,19 +5,17 @@ This module imports nothing heavy: ``geodelreg --help`` loads it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from geodelreg.errors import UsageError
 from geodelreg.option_checks import (
+    RESAMPLINGS,
     check_choice,
     check_creation,
     check_masks,
-    check_number,
     check_range,
-    field_of,
-    keep_list,
+    keep_bands,
+    knob,
 )
 
 METHODS = ("delaunay", "zhang2013", "sift")
@@ -30,31 +28,20 @@ GEOREFS = ("geotransform", "gcps")
 WARP_GRIDS = ("ms", "pan")
 ACCESS = ("local", "network", "all")
 SEARCHES = ("auto", "keypoints")
-EXTENTS = ("pan", "intersection")
 FIGURES = ("before-after", "arrows", "mesh", "error", "matches")
-RESAMPLINGS = ("nearest", "bilinear", "cubic", "cubicspline", "lanczos", "average")
-
-
-def _knob(default: Any, help_text: str, choices: tuple[str, ...] = ()) -> Any:
-    return field(default=default, metadata={"help": help_text, "choices": choices})
-
-
-def knob_help(options: type, name: str) -> str:
-    """Help text of one knob of an options class."""
-    return str(field_of(options, name).metadata["help"])
 
 
 @dataclass(frozen=True, slots=True)
 class AlignOptions:
     """How the correction is found."""
 
-    method: str = _knob(
+    method: str = knob(
         "delaunay",
         "delaunay: coarse to fine with Delaunay filtering and sub-pixel refinement; zhang2013: the "
         "paper's method, step by step; sift: plain SIFT and least squares, as a baseline.",
         METHODS,
     )
-    model: str = _knob(
+    model: str = knob(
         "auto",
         "Transformation of the header. auto takes the simplest that held-out points do not reject, "
         "north-up ones (shift, scale) before rotated ones (similarity, affine). No header holds a "
@@ -62,27 +49,33 @@ class AlignOptions:
         "comparison: MS is then resampled.",
         MODELS,
     )
-    north_up: bool = _knob(
+    north_up: bool = knob(
         False,
         "Never rotate or shear, whatever it would gain. Without it, model auto does when a corner "
         "moves by 0.1 PAN pixels or more, and held-out points ask for it.",
     )
-    band: int | None = _knob(
+    band: int | None = knob(
         None,
         "MS band to match on, from 1; auto weights the bands so that together they look like PAN.",
     )
-    per_band: bool = _knob(
+    per_band: bool = knob(
         False,
         "Correct each MS band by itself: one common map, and on top of it where each band lies. "
         "OUT is then a folder with one file per band, a .vrt, or resampled (`warp`).",
     )
-    band_model: str = _knob(
+    band_model: str = knob(
         "shift",
         "How a band may lie to the common map, with `per_band`.",
         ("shift", "affine"),
     )
-    pan_band: int = _knob(1, "Band of the PAN (reference) raster to match on, from 1.")
-    masks: tuple[str, ...] = _knob(
+    agreeing_bands: tuple[int, ...] = knob(
+        (),
+        "MS bands that must show the ground at one place, from 1, as N,N,...; those that are "
+        "matched on when not given. A warning names bands that lie 0.5 PAN pixels apart beyond "
+        "doubt; 1 pixel refuses.",
+    )
+    pan_band: int = knob(1, "Band of the PAN (reference) raster to match on, from 1.")
+    masks: tuple[str, ...] = knob(
         (),
         "Leave out the MS pixels that this mask hides; it is placed by its own header, in the "
         "frame of MS. A vector file hides what it touches; a Landsat QA_PIXEL or Sentinel-2 SCL "
@@ -90,63 +83,63 @@ class AlignOptions:
         "no-data hides. HIDE says it otherwise: values (3,8-10), or binary, landsat-qa, "
         "sentinel2-scl. May be repeated.",
     )
-    pan_masks: tuple[str, ...] = _knob(
+    pan_masks: tuple[str, ...] = knob(
         (),
         "The same for PAN. One of the two is enough for any place: a tie point needs both images.",
     )
-    search: str = _knob(
+    search: str = knob(
         "auto",
         "How delaunay finds the first guess. auto: where the header says, or a shift from there, "
         "when nothing in the images lets one doubt it, else by SIFT keypoints; keypoints: by "
         "keypoints alone.",
         SEARCHES,
     )
-    ms_nodata: float | None = _knob(
+    ms_nodata: float | None = knob(
         None,
         "Value of MS pixels that show nothing, whatever the file declares. Without it, what the "
         "file declares; where it declares nothing, 0 or the largest value that fills a corner.",
     )
-    pan_nodata: float | None = _knob(None, "The same for PAN.")
-    search_radius_px: float = _knob(
+    pan_nodata: float | None = knob(None, "The same for PAN.")
+    search_radius_px: float = knob(
         512.0,
         "How far off, in PAN pixels, the header may be for the first search; when that finds "
         "nothing, both rasters are searched whole.",
     )
-    tolerance_px: float = _knob(
+    tolerance_px: float = knob(
         0.02,
         "A correction that moves no pixel by more than this many PAN pixels and is not significant "
         "is not applied: the header stays, the verdict is already_aligned.",
     )
-    ratio: float = _knob(0.8, "Lowe's limit on nearest over second nearest descriptor distance.")
-    max_keypoints: int = _knob(
+    ratio: float = knob(0.8, "Lowe's limit on nearest over second nearest descriptor distance.")
+    max_keypoints: int = knob(
         6000,
         "Keypoints kept per image, strongest first; delaunay spreads them over the image, and on "
         "the first look takes a quarter of them, but 1500 where so many are allowed.",
     )
-    max_shift_px: float | None = _knob(
+    max_shift_px: float | None = knob(
         None, "Refuse a correction that shifts the centre by more PAN pixels than this."
     )
-    max_rotation_deg: float | None = _knob(
+    max_rotation_deg: float | None = knob(
         None, "Refuse a correction that rotates by more degrees than this."
     )
-    max_scale: float | None = _knob(
+    max_scale: float | None = knob(
         None,
         "Refuse a correction that scales by more than this factor (or by less than its inverse).",
     )
-    max_residual_px: float = _knob(
+    max_residual_px: float = knob(
         0.5,
         "Refuse a correction that leaves more PAN pixels RMS, beyond doubt, of the ground's bend: "
         "relief, a moving sensor, dropped rows.",
     )
-    on_local: str = _knob(
+    on_local: str = knob(
         "refuse",
         "What to do where one affine leaves more than `max_residual_px`: refuse; warn, and write "
         "the best affine of the whole overlap all the same; or follow the bend with a field, as "
         "auto does where the output can carry it.",
         ("refuse", "warn", "field"),
     )
-    threads: int = _knob(0, "Threads; 0 = all cores. The result does not depend on it.")
-    allow: str = _knob(
+    threads: int = knob(0, "Threads; 0 = all cores. The result does not depend on it.")
+    allow: str = knob(
         "local",
         "What names of rasters, and files, may open. local: files of this machine, also in "
         "archives, of formats that reach no others unseen; network: addresses and web services "
@@ -154,7 +147,7 @@ class AlignOptions:
         "of any file.",
         ACCESS,
     )
-    seed: int = _knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
+    seed: int = knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
 
     def __post_init__(self) -> None:
         check_choice(self, "method")
@@ -167,6 +160,13 @@ class AlignOptions:
             raise UsageError(
                 "`per_band=True` matches each band, by `method='delaunay'`",
                 "Drop `band`, and use that method.",
+            )
+        keep_bands(self, "agreeing_bands")
+        if self.agreeing_bands and (self.per_band or self.band):
+            raise UsageError(
+                "`agreeing_bands` are asked about where one correction is for all, and `band` and "
+                "`per_band` ask for another",
+                "Drop one of them.",
             )
         check_range(self, "pan_band", 1, 65535)
         check_masks(self, "masks")
@@ -221,34 +221,34 @@ def check_header_holds(model: str) -> None:
 class WriteOptions:
     """How the corrected raster is written."""
 
-    overwrite: bool = _knob(False, "Replace existing outputs; without it they are an error.")
-    driver: str | None = _knob(
+    overwrite: bool = knob(False, "Replace existing outputs; without it they are an error.")
+    driver: str | None = knob(
         None, "GDAL format of OUT, guessed from its extension when not given."
     )
-    creation_options: tuple[str, ...] = _knob(
+    creation_options: tuple[str, ...] = knob(
         (), "Creation option of the format, KEY=VALUE, as in GDAL; may be repeated."
     )
-    georef: str = _knob(
+    georef: str = knob(
         "geotransform",
         "geotransform: OUT carries the corrected geotransform; gcps: OUT carries the ground "
         "control points instead (a GeoTIFF holds one or the other).",
         GEOREFS,
     )
-    strip_rpc: bool = _knob(
+    strip_rpc: bool = knob(
         False, "Drop RPC tags, which would contradict the corrected geotransform."
     )
-    warp: bool = _knob(
+    warp: bool = knob(
         False,
         "Resample onto a north-up grid instead of correcting the header, for software that rejects "
         "rotated geotransforms.",
     )
-    warp_grid: str = _knob(
+    warp_grid: str = knob(
         "ms", "Grid of `warp`: the pixel size of MS, or exactly the grid of PAN.", WARP_GRIDS
     )
-    like: str | None = _knob(
+    like: str | None = knob(
         None, "Grid of `warp`: exactly that of this raster, in its CRS, instead of `warp_grid`."
     )
-    resampling: str = _knob(
+    resampling: str = knob(
         "cubic",
         "Resampling of `warp`; quality bands (as QA_PIXEL, SCL) and colour tables keep to nearest.",
         RESAMPLINGS,
@@ -274,29 +274,29 @@ class WriteOptions:
 class BatchOptions:
     """How many pairs are run."""
 
-    check: bool = _knob(False, "Verdicts only, as geodelreg check gives them; nothing is written.")
-    limit_px: float = _knob(
+    check: bool = knob(False, "Verdicts only, as geodelreg check gives them; nothing is written.")
+    limit_px: float = knob(
         0.5,
         "Largest misalignment, anywhere in the overlap, that `check` counts as aligned, in PAN "
         "pixels.",
     )
-    in_place: bool = _knob(
+    in_place: bool = knob(
         False, "Correct the headers of the MS files themselves; the pairs then have no OUT."
     )
-    workers: int = _knob(
+    workers: int = knob(
         0,
         "Pairs at a time on this machine, each in a process of one thread; 0 = as many as cores. "
         "On Dask: pairs under way, 0 = four for each thread of the cluster.",
     )
-    timeout_s: float | None = _knob(
+    timeout_s: float | None = knob(
         None, "Seconds that a pair may take; one that takes longer has failed."
     )
-    memory_mb: int | None = _knob(
+    memory_mb: int | None = knob(
         None,
         "Megabytes that the process of a pair may hold; a pair that needs more has failed. Needs "
         "Linux where the pairs run.",
     )
-    fail_fast: bool = _knob(
+    fail_fast: bool = knob(
         False, "Start no pair after one has failed; `resume` goes on with the rest."
     )
 
@@ -309,85 +309,3 @@ class BatchOptions:
             raise UsageError(
                 "`check=True` and `in_place=True` exclude each other", "Drop one of them."
             )
-
-
-@dataclass(frozen=True, slots=True)
-class PansharpenOptions:
-    """How the sharpened raster is made and written."""
-
-    overwrite: bool = _knob(False, "Replace existing outputs; without it they are an error.")
-    driver: str | None = _knob(
-        None,
-        "GTiff, COG (with overviews) or VRT, which is lazy and names its sources; by the extension "
-        "of OUT when not given.",
-    )
-    creation_options: tuple[str, ...] = _knob(
-        (), "Creation option of the format, KEY=VALUE, as in GDAL; may be repeated."
-    )
-    resampling: str = _knob("cubic", "Resampling of MS onto the grid of PAN.", RESAMPLINGS)
-    weights: str | Sequence[float] = _knob(
-        "auto",
-        "Weights of the sharpened bands in the image that PAN is divided by: auto fits them so "
-        "that together the bands look like PAN; equal; or numbers, W1,W2,...",
-    )
-    bands: str | Sequence[int] = _knob(
-        "all", "Bands of MS to sharpen, from 1, as N,N,...; all but alpha otherwise."
-    )
-    extent: str = _knob(
-        "pan", "pan: all of PAN's grid; intersection: its window that MS covers.", EXTENTS
-    )
-    nodata: float | None = _knob(
-        None, "No-data value of OUT; that of MS when not given, or a mask where MS has none."
-    )
-    bit_depth: int | None = _knob(
-        None, "Significant bits of the values (12 clips at 4095), for types with more of them."
-    )
-
-    def __post_init__(self) -> None:
-        check_choice(self, "resampling")
-        check_choice(self, "extent")
-        check_range(self, "bit_depth", 1, 32)
-        check_number(self, "nodata")
-        keep_list(self, "weights")
-        keep_list(self, "bands")
-        check_creation(self, "creation_options")
-        if self.weights not in ("auto", "equal"):
-            self.given_weights()
-        self.given_bands()
-
-    def given_weights(self) -> tuple[float, ...]:
-        """The weights as numbers.
-
-        Raises
-        ------
-        UsageError
-            They are none, or sum up to nothing.
-        """
-        try:
-            values = tuple(float(each) for each in _listed(self.weights))
-        except (TypeError, ValueError):
-            values = ()
-        if not values or not all(0 <= value < float("inf") for value in values) or not sum(values):
-            raise UsageError(
-                f"`weights={self.weights!r}` are no weights",
-                "Use auto, equal, or numbers of at least 0 such as 0.3,0.5,0.2.",
-            )
-        return values
-
-    def given_bands(self) -> tuple[int, ...]:
-        """Numbers of the bands, from 1; none when all are meant.
-
-        Raises
-        ------
-        UsageError
-        """
-        if self.bands == "all":
-            return ()
-        numbers = [str(each).strip() for each in _listed(self.bands)]
-        if not all(text.isdecimal() and int(text) > 0 for text in numbers):
-            raise UsageError(f"`bands={self.bands!r}` are no bands", "Use numbers such as 1,2,3.")
-        return tuple(int(text) for text in numbers)
-
-
-def _listed(value: str | Sequence[float]) -> Sequence[Any]:
-    return value.split(",") if isinstance(value, str) else value

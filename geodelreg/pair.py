@@ -128,12 +128,12 @@ class Pair:
 
 
 def bands_asked(source: WindowReader, options: AlignOptions) -> tuple[int, ...]:
-    """MS bands to look at, from 1: the one asked for, or all, or as many as help, evenly spread."""
+    """MS bands to look at, from 1: the one asked for, or all, or as many as help and were named."""
     count = len(source.band_names)
     if options.band:
         return (options.band,)
     spread = np.linspace(1, count, min(count, MOST_BANDS)).round()
-    return tuple(int(number) for number in spread)
+    return tuple(sorted({*map(int, spread), *options.agreeing_bands}))
 
 
 def make_pair(

@@ -16,7 +16,7 @@ from geodelreg.errors import UsageError
 from geodelreg.fine.tone import robust_band_weights
 from geodelreg.geotiff.atomic import together
 from geodelreg.knobs import PansharpenKnobs
-from geodelreg.options import BEYOND_A_HEADER, AlignOptions, PansharpenOptions
+from geodelreg.options import BEYOND_A_HEADER, AlignOptions
 from geodelreg.pair import Progress
 from geodelreg.product.common_grid import Sharpening, SpectralFile, check_finer
 from geodelreg.product.pansharpen import (
@@ -30,6 +30,7 @@ from geodelreg.product.scratch import file_of, scratch_folder
 from geodelreg.raster.inputs import AnyRaster, Opened, opened, rasters_of
 from geodelreg.raster.opening import dataset_grid, open_dataset
 from geodelreg.raster.reader import check_band, open_raster
+from geodelreg.sharpen_options import PansharpenOptions
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.result import Alignment, Correction
 from geodelreg.writing import (

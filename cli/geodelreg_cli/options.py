@@ -18,8 +18,8 @@ from click.core import ParameterSource
 
 from geodelreg.errors import UsageError
 from geodelreg.flags import UNITS, as_typed, flags
-from geodelreg.option_checks import field_of
-from geodelreg.options import AlignOptions, knob_help
+from geodelreg.option_checks import field_of, knob_help
+from geodelreg.options import AlignOptions
 from geodelreg_cli.console import configure_logging
 
 _Options = TypeVar("_Options")
@@ -122,6 +122,8 @@ def _kind(field: Field[Any]) -> dict[str, Any]:
     kind = str(field.type).split(" | ")[0]
     if kind == "bool":
         return {"is_flag": True, "default": field.default}
+    if kind.startswith("tuple[int"):
+        return {"type": click.STRING, "default": "", "metavar": "N,N,..."}
     if kind.startswith("tuple"):
         metavar = METAVARS.get(field.name, "KEY=VALUE")
         return {"multiple": True, "default": field.default, "metavar": metavar}

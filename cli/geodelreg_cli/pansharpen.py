@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from geodelreg.flags import as_typed
-from geodelreg.options import AlignOptions, PansharpenOptions
+from geodelreg.options import AlignOptions
+from geodelreg.sharpen_options import PansharpenOptions
 from geodelreg_cli.console import log_steps, progress_bar
 from geodelreg_cli.options import (
     SectionCommand,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from geodelreg.values.result import Alignment
 
 OUTPUT, SHARPENING, CORRECTION = "Output", "How to sharpen", "How to align"
+WITHOUT = ("threads", "allow", "ms_nodata", "pan_nodata", "agreeing_bands")
 WRITTEN = ("overwrite", "driver", "creation_options")
 
 EPILOG = """\
@@ -69,9 +71,7 @@ def pansharpen_params() -> list[SectionOption]:
             section=CORRECTION,
             help="Take MS where its header puts it, as after geodelreg align.",
         ),
-        *knob_options(
-            AlignOptions, CORRECTION, without=["threads", "allow", "ms_nodata", "pan_nodata"]
-        ),
+        *knob_options(AlignOptions, CORRECTION, without=WITHOUT),
         *run_options(),
     ]
 

@@ -97,6 +97,8 @@ def _empty(cell: Any) -> bool:
 def _value(field: Field[Any], cell: Any) -> Any:
     """A cell as the type of its option."""
     name, kind = field.name, str(field.type).split(" | ")[0]
+    if kind.startswith("tuple[int"):
+        return tuple(cell) if isinstance(cell, list) else str(cell).replace(";", ",")
     if kind.startswith("tuple"):
         return list_of(name, cell)
     text = cell.strip() if isinstance(cell, str) else cell

@@ -20,7 +20,8 @@ from geodelreg.geotiff.header import Provenance, merged_domains
 from geodelreg.geotiff.tiffwrite import edit_private, is_tiled
 from geodelreg.geotiff.view import corrected_view
 from geodelreg.masking import flag_bands
-from geodelreg.options import PansharpenOptions, WriteOptions
+from geodelreg.options import WriteOptions
+from geodelreg.sharpen_options import PansharpenOptions
 from geodelreg.tiff import is_tiff
 
 logger = logging.getLogger(__name__)

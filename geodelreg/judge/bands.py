@@ -4,36 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 from affine import Affine
 
 from geodelreg.coarse.correlation import best_shift
+from geodelreg.fine.band_offsets import BandPatches
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.matching import BandPass, match_band, match_bands
 from geodelreg.fine.overlay import Overlay
 from geodelreg.fine.passes import Refinement
 from geodelreg.geo.maps.affine import AffineMap
+from geodelreg.judge.unshared import PULL_PX
 from geodelreg.judge.words import lies
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.points import Guess
-from geodelreg.values.raster import Band, Float32Array, FloatArray
+from geodelreg.values.points import Guess, Status
+from geodelreg.values.raster import TINY, FloatArray
 
 _BAND_SHARE = 0.5
 """Of the patches that the best band matches: bands that match fewer have no say."""
 _SURE_SIGMAS = 3.0
-_CLEARLY = 0.9
-"""Of the unexplained detail: bands that were moved have 0.75 and less, others 0.96 and more."""
-_DETAIL_PX = 2.0
-"""Of the overview: only detail finer than this tells one place from the next."""
-_AROUND_PX = 0.5
-"""Of the overview: within this a parabola follows what remains unexplained."""
-_NO_MOVE = np.zeros(2)
-_ALL_VALID = 0.99  # share of a pixel that was resampled; the rest is rounding
+_TWO_SIDED_95 = 1.96  # standard errors
+_HEARD_SHARE = 0.01  # of what the bands add to the image matched: less places nothing
+_NEAR_PX = 0.25  # of MS: one step from where the bands lie is right of less, and too long of more
 _FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
 
@@ -73,41 +69,76 @@ def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
 
 
 def ground_apart(
-    found: Sequence[BandPass], guess: Guess, pair: Pair, least_px: float
+    found: Sequence[BandPass], refined: Refinement, correction: PixelMap, told_px: float
 ) -> BandsApart:
-    """The same of the ground alone: two bands that look like each other where they say they lie.
+    """The same of the ground alone: bands that must agree, each matched on all other bands.
 
     A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
-    place than its own.  So two bands are believed when each explains clearly more of the other's
-    detail once it is moved to where both find the same ground.
+    place than its own; among bands, what it shows alone widens its standard error.  Bands that must
+    agree are those that are matched on, or that were named.
 
     Parameters
     ----------
     found : sequence of BandPass
-        Each of one band alone, few matches or many.
-    guess : Guess
-        With the images that are looked at.
-    pair : Pair
-    least_px : float
-        MS pixels: bands that are no further apart are not looked at.
+        Each of one band alone, few matches or many: where else to look.
+    refined : Refinement
+    correction : PixelMap
+    told_px : float
+        MS pixels: bands that are no further apart are not looked at closely.
     """
-    images = guess.images.source
-    step = ~images[0].grid.transform @ pair.source.grid.transform
-    scale = np.array([step.a, step.e])
-    best, most = BandsApart(), 0.0
-    for gap in _gaps(found, pair):
-        if gap.sure_px <= least_px:
-            break
-        one, other, move = images[gap.one], images[gap.other], (gap.there - gap.here) * scale
-        little = _CLEARLY * _unexplained(one, other, _NO_MOVE)
-        there = _unexplained(one, other, move)
-        if there < little and _unexplained(other, one, -move) < little:
-            closer = gap.here + _closer(one, other, move, there) / scale
-            told = replace(gap, there=closer).told(pair)
-            # of pairs as far apart, the one that looks most alike is surest of where it lies
-            if told.distance_px * (1.0 - there) > most:
-                best, most = told, told.distance_px * (1.0 - there)
-    return best if best.distance_px > least_px else BandsApart()
+    part, last = refined.part, refined.last
+    pair = part.pair
+    ground = last.matched.template_px[last.status == Status.KEPT]
+    patches = BandPatches(part, refined.tiles, ground, correction, refined.size)
+    known = patches.glance()
+    if known is None:
+        return BandsApart()
+    pairs = list(combinations(_must_agree(pair, refined), 2))
+    starts = [np.zeros_like(known.offset_px)]
+    furthest = next(_gaps(found, pair), None)
+    if furthest is not None and furthest.sure_px > told_px:
+        starts.append(_by_pan(found, pair))
+    widest = max((float(np.hypot(*known.gap(*two)[0])) for two in pairs), default=0.0)
+    if widest > min(told_px, _NEAR_PX) or len(starts) > 1:
+        sought = [offsets for start in starts if (offsets := patches.measure(start)) is not None]
+        # a band at a place that is not its own is explained worse
+        known = min(
+            sought, key=lambda one: float(np.log(one.unexplained + TINY).sum()), default=known
+        )
+    best = BandsApart()
+    for one, other in pairs:
+        move, sigma_px = known.gap(one, other)
+        pull_px = PULL_PX * float(np.sqrt(known.unexplained[one] + known.unexplained[other]))
+        sure_px = float(np.hypot(*move)) - _TWO_SIDED_95 * float(np.hypot(sigma_px, pull_px))
+        if sure_px > best.distance_px:
+            best = BandsApart(sure_px, _told(pair, one, other, move))
+    return best
+
+
+def _must_agree(pair: Pair, refined: Refinement) -> list[int]:
+    """The bands that were named, else those with a weight, by their place among those read."""
+    named, tone = pair.options.agreeing_bands, refined.tuning.tone
+    if named:
+        return [pair.source_bands.index(number) for number in named if number in pair.source_bands]
+    part = tone.weights * tone.spread
+    return [int(band) for band in np.flatnonzero(part > _HEARD_SHARE * part.sum())]
+
+
+def _by_pan(found: Sequence[BandPass], pair: Pair) -> FloatArray:
+    """(B, 2) offsets of the bands, MS pixels, as PAN says."""
+    at, offsets = pair.source_centre, np.zeros((len(pair.source_bands), 2))
+    maps = [(p.band, p.found.estimate.map) for p in found if p.found.estimate is not None]
+    places = np.concatenate([m.forward(at) for _, m in maps])
+    # content that lies further right comes, at one pixel, from further left
+    offsets[[band for band, _ in maps]] = np.median(places, axis=0) - places
+    return offsets
+
+
+def _told(pair: Pair, one: int, other: int, move: FloatArray) -> str:
+    """How the second band lies to the first, (2,) MS pixels off."""
+    names = [pair.source.band_names[pair.source_bands[n] - 1] for n in (one, other)]
+    local = pair.header.linearise(pair.source_centre)[0, :, :2]
+    return f"{names[1]} {lies(local @ move, names[0])}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,12 +156,8 @@ class _Gap:
         return float(np.hypot(*(self.there - self.here))) - _SURE_SIGMAS * self.sigma_px
 
     def told(self, pair: Pair) -> BandsApart:
-        # content that lies further right comes, at one pixel, from further left
-        move = np.diff(pair.header.forward(np.stack([self.there, self.here])), axis=0)[0]
-        one, other = (
-            pair.source.band_names[pair.source_bands[n] - 1] for n in (self.one, self.other)
-        )
-        return BandsApart(max(self.sure_px, 0.0), f"{other} {lies(move, one)}")
+        words = _told(pair, self.one, self.other, self.here - self.there)
+        return BandsApart(max(self.sure_px, 0.0), words)
 
 
 def _gaps(found: Sequence[BandPass], pair: Pair) -> Iterator[_Gap]:
@@ -149,20 +176,6 @@ def _gaps(found: Sequence[BandPass], pair: Pair) -> Iterator[_Gap]:
         for n, m in combinations(np.argsort(odd, kind="stable").tolist(), 2)
     ]  # fmt: skip
     yield from sorted((gap for gap in gaps if gap.sure_px > 0), key=lambda gap: -gap.sure_px)
-
-
-def _closer(one: Band, other: Band, move: FloatArray, there: float) -> FloatArray:
-    """The move, pixels of the images, at which the bands explain most of each other.
-
-    A band that looks unlike PAN is matched to it some tenths of a pixel off; another band is not.
-    """
-    best = move.copy()
-    for axis in np.eye(2) * _AROUND_PX:
-        before, after = (_unexplained(one, other, move + side * axis) for side in (-1.0, 1.0))
-        bend = before - 2.0 * there + after
-        if bend > 0:
-            best += np.clip((before - after) / (2.0 * bend), -1.0, 1.0) * axis
-    return best
 
 
 def _heard(found: Sequence[BandPass]) -> list[BandPass]:
@@ -206,24 +219,3 @@ def _start(guess: Guess, pair: Pair, band: int, heard: set[int]) -> AffineMap | 
         return None
     step = ~pair.source.grid.transform @ mine.grid.transform
     return AffineMap(Affine.translation(-shift[0] * step.a, -shift[1] * step.e))
-
-
-def _unexplained(one: Band, other: Band, moved: FloatArray) -> float:
-    """Share of one band's detail, read (x, y) further, that the other does not explain."""
-    height, width = one.valid.shape
-    matrix = np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]])
-    how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    there = cv2.warpAffine(np.asarray(one.data, np.float32), matrix, (width, height), flags=how)
-    usable = cv2.warpAffine(one.valid.astype(np.float32), matrix, (width, height), flags=how)
-    window = np.ones((2 * round(3 * _DETAIL_PX) + 1,) * 2, dtype=np.uint8)
-    inner = cv2.erode((other.valid & (usable > _ALL_VALID)).astype(np.uint8), window) > 0
-    if not inner.any():
-        return 1.0
-    mine = _detail(np.asarray(there, np.float32))[inner]
-    theirs = _detail(np.asarray(other.data, np.float32))[inner]
-    energy = float(mine @ mine) * float(theirs @ theirs)
-    return 1.0 - float(mine @ theirs) ** 2 / energy if energy > 0 else 1.0
-
-
-def _detail(image: Float32Array) -> Float32Array:
-    return np.asarray(image - cv2.GaussianBlur(image, (0, 0), _DETAIL_PX), dtype=np.float32)

@@ -70,7 +70,8 @@ def gather(
         repeats = pool.submit(proof_without_repeated, refined, correction, enough)
         bands = find_bands(guess, refined, correction, pool)
         apart = bands_apart(bands, pair)
-        told = ground_apart(bands, guess, pair, BANDS_TOLD_PX / pair.pan_px_per_source_px)
+        told_px = BANDS_TOLD_PX / pair.pan_px_per_source_px
+        told = ground_apart(bands, refined, correction, told_px)
         (accuracy, rival), area, repeated = whole.result(), places.result(), repeats.result()
     turn_deg, scale = turn_and_scale(pair, correction)
     return accuracy, Evidence(

@@ -147,9 +147,11 @@ def bands_warning(evidence: Evidence) -> tuple[str, ...]:
     if not evidence.bands > BANDS_TOLD_PX:
         return ()
     note = (
-        f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least)"
+        f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least); "
+        "the correction is not right for both: `per_band=True` corrects each by itself, `band=N` "
+        "matches on one"
     )
-    return (f"{note}; the correction is not right for both, `band=N` matches on one",)
+    return (note,)
 
 
 def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:

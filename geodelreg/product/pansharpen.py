@@ -26,7 +26,6 @@ from geodelreg.geotiff import sidecars
 from geodelreg.geotiff.atomic import staged
 from geodelreg.geotiff.environment import gdal_session
 from geodelreg.geotiff.rewrite import gdal_write, output_driver, user_creation
-from geodelreg.options import PansharpenOptions
 from geodelreg.product.brovey import Source, pansharpened_xml, tiles
 from geodelreg.product.common_grid import (
     Recipe,
@@ -41,6 +40,7 @@ from geodelreg.product.common_grid import (
 from geodelreg.product.pixels import Validity, geotiff_on
 from geodelreg.product.scratch import scratch_folder
 from geodelreg.product.warp import warped_onto
+from geodelreg.sharpen_options import PansharpenOptions
 from geodelreg.values.raster import Float32Array, Grid
 
 _BLOCK_PX = 512

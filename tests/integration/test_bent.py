@@ -252,7 +252,8 @@ def test_bands_that_lie_apart_are_refused_and_named_however_far(
     assert "bands" in failed(alignment)
     told = re.search(r"band 3 lies ([\d.]+) px right and ([\d.]+) px down of band", str(error))
     assert told is not None
-    assert [float(number) for number in told.groups()] == pytest.approx(np.negative(shift), abs=0.2)
+    # the bands of the imagery lie a quarter of a pixel apart themselves
+    assert [float(number) for number in told.groups()] == pytest.approx(np.negative(shift), abs=0.3)
     assert "`band" in error.remedy
     alone = geodelreg.align(apart.ms, apart.pan, AlignOptions(band=1))
     assert np.abs(apart.pair.errors(alone.correction.corrected)).max() < 0.1
@@ -269,7 +270,9 @@ def test_bands_that_lie_apart_two_by_two_are_refused(tmp_path: Path) -> None:
     scene = make_scene(SPEC, sample_imagery(), band_shifts=(still, still, shift, shift))
     error, alignment = refusal(written(tmp_path, BentPair(scene)))
     assert "bands" in failed(alignment)
-    assert "3 px left and 4 px down of band" in str(error)
+    told = re.search(r"([\d.]+) px left and ([\d.]+) px down of band", str(error))
+    assert told is not None
+    assert [float(number) for number in told.groups()] == pytest.approx((3.0, 4.0), abs=0.3)
 
 
 @pytest.mark.parametrize("start", [(64, 248), (60, 256)])

@@ -1,0 +1,74 @@
+"""Bands are held against each other, whether they look like PAN or not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+import geodelreg
+from benchmarks.scenes.imagery import sample_imagery
+from benchmarks.scenes.make import HeaderError, SceneSpec, make_scene, write_scene
+from geodelreg import AlignOptions
+from geodelreg.errors import AlignmentRefusedError, BandNumberError, UsageError
+
+SPEC = SceneSpec("agree", "", HeaderError((2.3, -1.7)), (800, 800), (180, 180), ratio=4.0)
+STILL = (0.0, 0.0)
+
+
+def made(folder: Path, infrared: tuple[float, float]) -> tuple[Path, Path]:
+    """MS whose infrared, which PAN does not hold, lies elsewhere by so many PAN pixels."""
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=(STILL, STILL, STILL, infrared))
+    write_scene(scene, folder)
+    return folder / "ms.tif", folder / "pan.tif"
+
+
+def warned(alignment: geodelreg.Alignment) -> bool:
+    return any("bands do not agree" in warning for warning in alignment.warnings)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_named_band_is_held_against_the_others_whatever_it_looks_like(
+    inverted: bool, tmp_path: Path
+) -> None:
+    ms, pan = made(tmp_path, (-1.2, -1.6))
+    if inverted:
+        with rasterio.open(ms, "r+") as dataset:
+            infrared = dataset.read(4).astype(np.int32)
+            dataset.write((infrared.max() + 100 - infrared).astype(np.uint16), 4)
+    assert not warned(geodelreg.align(ms, pan))  # PAN holds none of it
+    with pytest.raises(
+        AlignmentRefusedError, match=r"band 4 lies 1\.\d px right and 1\.\d px down"
+    ):
+        geodelreg.align(ms, pan, agreeing_bands=(2, 4))
+    assert not warned(geodelreg.align(ms, pan, agreeing_bands=(1, 2)))
+    one = geodelreg.check(ms, pan, agreeing_bands=(2, 4))
+    assert one.outcome.value == "cannot_tell"
+
+
+def test_between_half_a_pixel_and_one_the_bands_are_named_in_a_warning(tmp_path: Path) -> None:
+    ms, pan = made(tmp_path, (0.9, 0.0))
+    alignment = geodelreg.align(ms, pan, agreeing_bands=[2, 4])
+    (text,) = (warning for warning in alignment.warnings if "bands do not agree" in warning)
+    assert "band 4 lies" in text
+    assert "of band 2" in text
+    assert "`per_band=True`" in text
+
+
+def test_a_band_that_only_looks_unlike_pan_is_not_apart(tmp_path: Path) -> None:
+    ms, pan = made(tmp_path, STILL)
+    assert not warned(geodelreg.align(ms, pan, agreeing_bands=(1, 2, 3, 4)))
+
+
+def test_bands_to_agree_exist_and_are_more_than_one() -> None:
+    with pytest.raises(UsageError, match="one band"):
+        AlignOptions(agreeing_bands=(3,))
+    with pytest.raises(UsageError, match="are no bands"):
+        AlignOptions(agreeing_bands=(0, 1))
+    with pytest.raises(UsageError, match="ask for another"):
+        AlignOptions(agreeing_bands=(1, 2), band=1)
+    samples = Path(__file__).parents[2] / "sample_tiles"
+    with pytest.raises(BandNumberError):
+        geodelreg.align(samples / "ms.tif", samples / "pan.tif", agreeing_bands=(1, 9))
