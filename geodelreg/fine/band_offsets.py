@@ -26,8 +26,8 @@ _TILES = 8  # evenly spread
 _PATCHES = 120  # or a few more: offsets are then known to a hundredth of a pixel
 _PATCHES_EACH = 5  # for each unknown: the spread of fewer does not tell how sure it is
 _LEAST_SHARE = 0.5  # of a patch: valid in all bands
-_BLURS_PX = (1.0, 0.0, 0.0)
-"""Of MS, from step to step: a band is found from a pixel or two off, then exactly."""
+_STEPS = 3  # from a pixel or two off
+_BLUR_PX = 1.0  # of MS: detail finer than its pixels lies with these, and draws bands onto one grid
 _LARGEST_STEP_PX = 1.0
 _RIDGE = 1e-6  # of the power of the bands: they may be copies of each other
 
@@ -108,8 +108,8 @@ class BandPatches:
     def measure(self, start: FloatArray) -> BandOffsets | None:
         """Offsets to the end, from (B, 2) MS pixels."""
         at, found = start, None
-        for blur in _BLURS_PX:
-            found = self._step(at, blur)
+        for _ in range(_STEPS):
+            found = self._step(at, _BLUR_PX)
             if found is None:
                 return None
             at = found.offset_px

@@ -30,7 +30,10 @@ from geodelreg.values.result import BandMap
 _BLURS_PX = (2.0, 2.0, 1.0, 0.0, 0.0)
 """Of MS, from step to step against PAN alone: a band is found from so far off, then exactly."""
 _TOGETHER = 4  # steps more against all others: each takes up most of what is left
-_MOST_PIXELS = 150_000  # of MS: twice as many halve no error that matters, and cost twice
+_TOGETHER_BLUR_PX = 1.0
+"""Of MS: bands hold detail finer than their pixels, which lies with the pixels and not with the
+ground, so that two of them draw each other onto one grid: by up to 0.07 PAN px at 4:1 without."""
+_MOST_PIXELS = 300_000  # of MS: a band is then known to some hundredths of a PAN pixel
 _EDGE_PX = 4  # of a tile, where gradients and displaced bands see what lies outside
 _FEWEST_PIXELS = 64  # of a patch: more than there are unknowns
 _MOST_SIGMA_PX = 0.1  # of MS: a band of which less is known is not said to lie anywhere
@@ -81,7 +84,7 @@ def match_each_band(
         fit.step(blur, against=())
     sure = [band for band in fit.bands if fit.is_sure(band)]
     for _ in range(_TOGETHER):
-        fit.step(0.0, against=sure)
+        fit.step(_TOGETHER_BLUR_PX, against=sure)
     likeness = fit.likeness()
     return tuple(fit.band_map(band, likeness[band]) for band in fit.bands if fit.is_sure(band))
 
@@ -154,7 +157,7 @@ class _Fit:
             systems = [one for tile in found for one in tile]
         if not systems:
             return
-        solved, variance = _solved(systems)
+        solved, variance = _solved(systems, len(self.bands))
         own = 2 * self.terms * len(self.bands)
         steps, doubt = (v[:own].reshape(-1, 2, self.terms) for v in (solved, variance))
         self.move[:, :, : self.terms] += np.clip(steps, -1.0, 1.0)
@@ -239,10 +242,11 @@ def _unexplained(
     return design @ design.T, -design @ goal, float(goal @ goal), len(goal)
 
 
-def _solved(systems: Sequence[_System]) -> tuple[FloatArray, FloatArray]:
-    """Unknowns of least squares and their variances, by the spread of the parts' own scores.
+def _solved(systems: Sequence[_System], bands: int) -> tuple[FloatArray, FloatArray]:
+    """Unknowns of least squares and their variances, by the spread of the patches' own scores.
 
-    Parts that are explained worse than most count for less.
+    The bands of a patch, so many, follow each other: they explain each other, and err together.
+    Those that are explained worse than most count for less.
     """
     normal, right = (np.stack([one[i] for one in systems]) for i in (0, 1))
     energy, count = (np.array([one[i] for one in systems]) for i in (2, 3))
@@ -254,7 +258,7 @@ def _solved(systems: Sequence[_System]) -> tuple[FloatArray, FloatArray]:
         solved = inverse @ np.einsum("t,ti->i", trust, right)
         left = energy - 2 * right @ solved + np.einsum("i,tij,j->t", solved, normal, solved)
         variance = np.maximum(left, 0.0) / count
-    score = trust[:, None] * (right - normal @ solved)
+    score = (trust[:, None] * (right - normal @ solved)).reshape(-1, bands, len(solved)).sum(axis=1)
     covariance = inverse @ (score.T @ score) @ inverse
     doubt = np.where(np.diag(total) > 0, np.maximum(np.diag(covariance), 0.0), np.inf)
     return solved, doubt
