@@ -11,8 +11,8 @@ from geodelreg.options import AlignOptions
 from geodelreg.product.report import report_schema
 
 NO_NAME = {
-    "schema_version", "tool", "tool.name", "created", "inputs", "tie_points.check",
-    "tie_points.points[].is_check", "step_counts[]", "step_counts[].step", "step_counts[].points",
+    "schema_version", "tool", "tool.name", "created", "inputs", "step_counts[]",
+    "step_counts[].step", "step_counts[].points",
 }  # fmt: skip
 """What only the document has."""
 OTHER_NAMES = {
@@ -48,6 +48,7 @@ which is installed as `geodelreg/product/schema/report.schema.json`.
 - *Python* is the name of the same value, for `alignment = geodelreg.align(…)` or `check =
   geodelreg.check(…)`, where the evidence is `alignment = check.alignment`. `i` counts from 0, and
   `Status` is `geodelreg.values.points.Status`.
+- [Reports of version 1](how-to/reports.md#reports-of-version-1) lists what changed.
 """
 
 

@@ -29,6 +29,7 @@ class AlignKnobs(TypedDict, total=False):
     max_shift_px: float | None
     max_rotation_deg: float | None
     max_scale: float | None
+    max_uncertainty_px: float | None
     max_residual_px: float
     on_local: str
     threads: int

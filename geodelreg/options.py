@@ -126,6 +126,12 @@ class AlignOptions:
         None,
         "Refuse a correction that scales by more than this factor (or by less than its inverse).",
     )
+    max_uncertainty_px: float | None = knob(
+        None,
+        "Refuse a correction that may be further off than this many PAN pixels at the worst corner "
+        "of the overlap, with 95 % certainty. Without it the limit is 1.2, a standard error of "
+        "0.7.",
+    )
     max_residual_px: float = knob(
         0.5,
         "Refuse a correction that leaves more PAN pixels RMS, beyond doubt, of the ground's bend: "
@@ -178,6 +184,7 @@ class AlignOptions:
         check_range(self, "max_shift_px", 0, 1e9)
         check_range(self, "max_rotation_deg", 0, 180)
         check_range(self, "max_scale", 1, 1e3)
+        check_range(self, "max_uncertainty_px", 0, 1e6)
         check_range(self, "max_residual_px", 0, 1e6)
         check_choice(self, "on_local")
         if self.north_up and self.model not in ("auto", "shift", "scale"):

@@ -45,6 +45,9 @@ _OF_BANDS = ("bands_apart", "bands")
 _BANDS_APART = "PAN px at least between the places of two MS bands"
 _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
+_UNCERTAINTY = "PAN px uncertainty (95 %) at the worst corner"
+RADIAL_95 = 1.73
+"""Radius that 95 % of errors stay within, over their root mean square: √(ln 20)."""
 SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
 SIGNIFICANCE = 3.0
 MAX_BANDS_PX = 1.0
@@ -144,6 +147,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     most_px = options.max_residual_px if options.on_local == "refuse" else None
     repeated = _MAX_LOG_TOGETHER if evidence.repeated is not None else None
     whole = (
+        ("max_uncertainty", "≤", options.max_uncertainty_px, _UNCERTAINTY),
         ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
         ("bands", "≤", MAX_BANDS_PX, f"{_BANDS_APART}{which}"),
         _strain_limit(evidence.strain),
@@ -156,6 +160,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         "max_shift": evidence.shift_px,
         "max_rotation": evidence.rotation_deg,
         "max_scale": evidence.scale,
+        "max_uncertainty": RADIAL_95 * evidence.sigma_px,
         "two_motions": evidence.moved,
         "local": evidence.residual_low_px,
     }

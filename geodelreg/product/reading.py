@@ -20,7 +20,6 @@ from geodelreg.geo.maps.projective import ProjectiveMap
 from geodelreg.geo.maps.tin import TinMap
 from geodelreg.masking import MaskUse
 from geodelreg.options import AlignOptions
-from geodelreg.product.report import SCHEMA_VERSION
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import NO_TIE_POINTS, Status, TiePoints
 from geodelreg.values.raster import FloatArray, Grid
@@ -35,6 +34,8 @@ from geodelreg.values.result import (
     Verdict,
 )
 
+_READ = ("1.", "2.")
+"""Versions of the schema: 1 has fields more, which mean nothing to us, and lacks some."""
 MOST_BYTES = 256_000_000
 """Of a report: one of 100 000 tie points has 60 MB."""
 
@@ -55,7 +56,7 @@ def read_report(path: Path) -> Alignment:
     Raises
     ------
     ReportError
-        The file cannot be read, or is no report of this version.
+        The file cannot be read, or is no report of a version that is known.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -72,10 +73,9 @@ def read_report(path: Path) -> Alignment:
             f"{path} is no JSON ({error})", "Name the JSON file of `write_report`."
         ) from error
     version = report.get("schema_version") if isinstance(report, dict) else None
-    if version != SCHEMA_VERSION:
+    if not str(version).startswith(_READ):
         raise ReportError(
-            f"{path} is no report of version {SCHEMA_VERSION}"
-            + (f" but of {version}" if version else ""),
+            f"{path} is no report of version 1 or 2" + (f" but of {version}" if version else ""),
             "Make it again: geodelreg align MS PAN --dry-run --report FILE.json.",
         )
     try:
@@ -102,7 +102,7 @@ def _alignment(report: Mapping[str, Any]) -> Alignment:
         step_counts={str(step["step"]): int(step["points"]) for step in report["step_counts"]},
         band_weights={str(k): float(v) for k, v in report["band_weights"].items()},
         warnings=warnings,
-        bands=tuple(_band(band, source.grid) for band in report["bands"]),
+        bands=tuple(_band(band, source.grid) for band in report.get("bands", ())),
     )
     return Alignment(
         source=source,
@@ -182,9 +182,17 @@ def _known(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _accuracy(given: Mapping[str, Any]) -> Accuracy:
-    known = _known(given)
-    low, high = _floats(given["residual_interval_px"]).tolist()
-    return Accuracy(**known | {"residual_interval_px": (low, high)})
+    known = _known(_fields_of(Accuracy, given))
+    if "residual_interval_px" in known:
+        low, high = _floats(known["residual_interval_px"]).tolist()
+        known["residual_interval_px"] = low, high
+    return Accuracy(**known)
+
+
+def _fields_of(kind: type, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What this version knows of; what an older one did not write has its default."""
+    names = {field.name for field in fields(kind)}
+    return {name: value for name, value in given.items() if name in names}
 
 
 def _mask(given: Mapping[str, Any]) -> MaskUse:
@@ -196,6 +204,7 @@ def _reason(given: Mapping[str, Any]) -> Reason:
 
 
 def _options(given: Mapping[str, Any]) -> AlignOptions:
+    known = _fields_of(AlignOptions, given)
     lists = {field.name for field in fields(AlignOptions) if str(field.type).startswith("tuple")}
-    values: dict[str, Any] = {k: tuple(v) if k in lists else v for k, v in given.items()}
+    values: dict[str, Any] = {k: tuple(v) if k in lists else v for k, v in known.items()}
     return AlignOptions(**values)

@@ -22,7 +22,7 @@ from geodelreg.values.raster import FloatArray, Grid
 from geodelreg.values.result import Alignment, BandMap, Outcome
 from geodelreg.version import __version__
 
-SCHEMA_VERSION = "1.6"
+SCHEMA_VERSION = "2.0"
 LATTICE = 17
 """Places along each axis where the standard error of the correction is listed."""
 _UNSHOWN = re.compile("[\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069]")
@@ -199,15 +199,13 @@ def _tie_points(points: TiePoints, listed: bool) -> dict[str, Any]:
     counts = np.bincount(points.status, minlength=len(Status))
     report: dict[str, Any] = {
         "total": len(points),
-        "check": 0,  # until schema 2.0: no point is held out of the fit for good
         "by_status": {status.name.lower(): counts[status] for status in Status},
     }
     if listed:
         names = "source_px", "reference_px", "covariance_px2", "score", "residual_px"
         each = zip(*(getattr(points, name).tolist() for name in names), strict=True)
         report["points"] = [
-            {"status": Status(status).name.lower(), "is_check": False}
-            | dict(zip(names, values, strict=True))
+            {"status": Status(status).name.lower()} | dict(zip(names, values, strict=True))
             for status, values in zip(points.status.tolist(), each, strict=True)
         ]
     return report

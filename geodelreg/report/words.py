@@ -102,6 +102,7 @@ REASONS = {
     ),
     "max_shift": ("Shift within your limit", "As asked with `max_shift_px`."),
     "max_rotation": ("Rotation within your limit", "As asked with `max_rotation_deg`."),
+    "max_uncertainty": ("Uncertainty within your limit", "As asked with `max_uncertainty_px`."),
     "max_scale": ("Scale within your limit", "As asked with `max_scale`."),
     "two_motions": (
         "No motion beside the bend",
@@ -135,6 +136,7 @@ FAILED = {
     "keypoints_apart": "Distinct features say another place than the patches.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",
+    "max_uncertainty": "The place is less well known than you allowed.",
     "max_scale": "The scale differs by more than you allowed.",
     "two_motions": "A part of the picture lies elsewhere than the rest.",
     "local": "One affine, and so a header, cannot follow all of the ground.",

@@ -58,6 +58,13 @@ _REMEDIES = (
         ),
     ),
     (
+        {"max_uncertainty"},
+        (
+            "The correction is less well known than you allowed (`max_uncertainty_px`): a simpler "
+            "`model`, more of the scene, or bands that look more like PAN make it surer."
+        ),
+    ),
+    (
         {"sigma_px", "coverage", "disagreement_px"},
         (
             "Too little of the overlap shows common ground to know its corners: a simpler `model` "

@@ -94,7 +94,7 @@ def test_issues_ask_for_the_report(template: Path) -> None:
 
 def test_every_reason_of_the_gate_has_an_entry_that_begins_with_its_message() -> None:
     unknown = dict.fromkeys((field.name for field in fields(Evidence)), float("nan"))
-    options = AlignOptions(max_shift_px=50, max_rotation_deg=1, max_scale=2)
+    options = AlignOptions(max_shift_px=50, max_rotation_deg=1, max_scale=2, max_uncertainty_px=0.2)
     messages = {reason.name: reason.message for reason in judge(Evidence(**unknown), options)}
     page = (ROOT / "docs" / "refusals.md").read_text(encoding="utf-8")
     entries = re.findall(r"^### ([^\n]*)\n\n> ([^\n]*)\n(.*?)(?=^#)", page, re.M | re.S)

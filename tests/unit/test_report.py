@@ -111,7 +111,6 @@ def test_geotransforms_are_in_gdal_order() -> None:
 def test_points_are_counted_by_status() -> None:
     points = report_dict(alignment(), tie_points=True)["tie_points"]
     assert points["total"] == 5
-    assert points["check"] == 0
     assert {name: count for name, count in points["by_status"].items() if count} == {
         "kept": 4,
         "star": 1,
@@ -119,7 +118,6 @@ def test_points_are_counted_by_status() -> None:
     assert points["points"][4]["status"] == "star"
     assert points["points"][4]["residual_px"] == [None, None]
     assert points["points"][0]["source_px"] == [90.5, 70.25]
-    assert points["points"][0]["is_check"] is False
 
 
 def test_steps_stay_in_their_order() -> None:

@@ -282,7 +282,13 @@ def test_what_was_not_measured_has_neither_passed_nor_failed(
 def test_each_reason_of_the_gate_has_its_words() -> None:
     kinds = {"words": "", "bands_words": ""}
     unknown = {field.name: kinds.get(field.name, float("nan")) for field in fields(Evidence)}
-    limits = AlignOptions(max_shift_px=1.0, max_rotation_deg=1.0, max_scale=1.1, on_local="refuse")
+    limits = AlignOptions(
+        max_shift_px=1.0,
+        max_rotation_deg=1.0,
+        max_scale=1.1,
+        max_uncertainty_px=1,
+        on_local="refuse",
+    )
     reasons = (*judge(Evidence(**unknown), limits), too_few_for_a_field(5))  # type: ignore[arg-type]
     assert {"strain", "bands", "local", "max_shift"} <= {reason.name for reason in reasons}
     for found in map(bar, reasons):
