@@ -24,12 +24,14 @@ from geodelreg.judge.check import (
     measure_misalignment,
     without_one_place,
 )
+from geodelreg.judge.words import first_of_many
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
+from geodelreg.raster.likeness import likest_band
 from geodelreg.raster.mask_report import mask_uses, mask_warnings, much_hidden, under_masks
 from geodelreg.raster.reader import RasterReader, check_band, open_raster
 from geodelreg.second_look import align_rasters
@@ -50,14 +52,15 @@ class _Rasters:
     source: Input
     reference: Input
     timings: Timings
-    fill_notes: tuple[str, ...]
+    options: AlignOptions
+    early_notes: tuple[str, ...]
 
     def notes(self) -> tuple[str, ...]:
         """What a user should know of the files."""
         ms, pan = self.ms, self.pan
         files = [one for one in (self.source, self.reference) if not one.in_memory]
         unsure = [unsettled(Path(path)) for one in files for path in one.paths]
-        notes = (*self.fill_notes, ms.block_note, pan.block_note, *unsure, *mask_warnings(ms, pan))
+        notes = (*self.early_notes, ms.block_note, pan.block_note, *unsure, *mask_warnings(ms, pan))
         return tuple(dict.fromkeys(note for note in notes if note))
 
 
@@ -86,8 +89,12 @@ def _open(
                 check_band(ms, options.band)
             for number in options.agreeing_bands:
                 check_band(ms, number)
-            check_band(pan, options.pan_band)
             fill = ms.leave_out(options.ms_nodata), pan.leave_out(options.pan_nodata)
+            chosen = ""
+            if not options.pan_band:
+                number, chosen = likest_band(pan)
+                options = replace(options, pan_band=number)
+            check_band(pan, options.pan_band)
         for role, reader in (("MS", ms), ("PAN", pan)):
             height, width = reader.grid.shape
             logger.info(
@@ -95,8 +102,8 @@ def _open(
                 role, reader.name, width, height, ", ".join(reader.band_names),
                 reader.grid.transform.to_gdal(),
             )  # fmt: skip
-        notes = tuple(note for note in fill if note)
-        yield _Rasters(ms, pan, _input(ms), _input(pan), timings, notes)
+        notes = tuple(note for note in (*fill, chosen) if note)
+        yield _Rasters(ms, pan, _input(ms), _input(pan), timings, options, notes)
 
 
 def _input(reader: RasterReader) -> Input:
@@ -254,7 +261,7 @@ def refit(
         pan_grid = None if pan is None else pan.grid
         given = given_points(file, format, rasters.ms.grid, pan_grid, options.band)
         pair, solution = refit_pair(
-            rasters.ms, pan, given, options, snap, progress, rasters.timings
+            rasters.ms, pan, given, rasters.options, snap, progress, rasters.timings
         )
         read = Input((str(file),), rasters.ms.grid, (fingerprint(file),), in_memory=True)
         alignment = _alignment(rasters, pair, solution, rasters.notes())
@@ -356,13 +363,18 @@ def _check_bands(
 
 
 def _solve(
-    rasters: _Rasters, options: AlignOptions, progress: Progress | None
+    rasters: _Rasters, asked: AlignOptions, progress: Progress | None
 ) -> tuple[Pair, Solution]:
     """What the images of two open rasters say."""
+    options = rasters.options
     try:
-        return align_rasters(rasters.ms, rasters.pan, options, progress, rasters.timings)
+        pair, solution = align_rasters(rasters.ms, rasters.pan, options, progress, rasters.timings)
     except NoDataError as error:
         raise under_masks(error, rasters.ms, rasters.pan) from error
+    if not asked.pan_band:  # it was chosen: no question whether it is the right one
+        kept = tuple(note for note in solution.warnings if note != first_of_many(pair))
+        solution = replace(solution, warnings=kept)
+    return pair, solution
 
 
 def _alignment(

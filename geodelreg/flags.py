@@ -67,6 +67,8 @@ def arguments(knob: str, value: object) -> list[str]:
     flag = flags(knob)[-1]
     if isinstance(value, bool):
         return [flag] if value else []
+    if knob == "pan_band" and value == 0:
+        return [flag, "auto"]
     values: Iterable[object] = value if isinstance(value, list | tuple) else (value,)
     return [text for each in values for text in (flag, str(each))]
 

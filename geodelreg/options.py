@@ -74,7 +74,11 @@ class AlignOptions:
         "matched on when not given. A warning names bands that lie 0.5 PAN pixels apart beyond "
         "doubt; 1 pixel refuses.",
     )
-    pan_band: int = knob(1, "Band of the PAN (reference) raster to match on, from 1.")
+    pan_band: int = knob(
+        1,
+        "Band of the PAN (reference) raster to match on, from 1; 0 (auto) takes the one that "
+        "resembles the others most, and says which.",
+    )
     masks: tuple[str, ...] = knob(
         (),
         "Leave out the MS pixels that this mask hides; it is placed by its own header, in the "
@@ -174,7 +178,7 @@ class AlignOptions:
                 "`per_band` ask for another",
                 "Drop one of them.",
             )
-        check_range(self, "pan_band", 1, 65535)
+        check_range(self, "pan_band", 0, 65535)
         check_masks(self, "masks")
         check_masks(self, "pan_masks")
         check_range(self, "search_radius_px", 0, 1e7)

@@ -145,7 +145,7 @@ def check_sharpenable(
         _check_vrt_holds(target, "field" if align.on_local == "field" else align.model)
     paths, pan_path = [as_path(source) for source in sources], as_path(reference)
     with allowing(align.allow):
-        _sharpening(paths, pan_path, align.pan_band, options, None, align.allow)
+        _sharpening(paths, pan_path, align.pan_band or 1, options, None, align.allow)
 
 
 def _sharpening(

@@ -52,8 +52,12 @@ class NumberOr(click.ParamType):  # type: ignore[type-arg]  # generic from click
             self.fail(f"{value!r} is neither a whole number nor {self.word}.", param, ctx)
 
 
-# Knobs whose default is a word on the command line.
-WORDS = {"band": NumberOr("auto", None), "threads": NumberOr("ALL_CPUS", 0)}
+# Knobs of which a value is a word on the command line.
+WORDS = {
+    "band": NumberOr("auto", None),
+    "pan_band": NumberOr("auto", 0),
+    "threads": NumberOr("ALL_CPUS", 0),
+}
 
 
 GCP_FORMAT = click.Choice(
@@ -129,7 +133,8 @@ def _kind(field: Field[Any]) -> dict[str, Any]:
         return {"multiple": True, "default": field.default, "metavar": metavar}
     if field.name in WORDS:
         word = WORDS[field.name]
-        return {"type": word, "default": word.word, "show_default": True, "metavar": word.name}
+        default = word.word if field.default == word.meaning else str(field.default)
+        return {"type": word, "default": default, "show_default": True, "metavar": word.name}
     choices = field.metadata["choices"]
     unit = next((UNITS[u] for u in UNITS if field.name.endswith(u)), None)
     return {

@@ -96,6 +96,8 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     from geodelreg.sharpen import check_sharpenable
     from geodelreg_cli.outputs import check_targets
 
+    if given["no_align"] and not align_options.pan_band:
+        raise click.UsageError("--pan-band auto is found by aligning: name the band, N.")
     check_targets([*sources, reference], [given["output"]], options.overwrite)
     if not given["no_align"]:
         # the geotransforms of a VRT must hold the correction
@@ -116,7 +118,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
             options,
             alignment=alignment,
             allow=align_options.allow,
-            pan_band=align_options.pan_band,
+            pan_band=(alignment.options if alignment else align_options).pan_band,
             progress=part_of(step, parts - 1, parts),
         )
     for warning in alignment.warnings if alignment else ():

@@ -91,10 +91,16 @@ def _doubts_of_match(pair: Pair) -> Iterator[str]:
             "is corrected, comes first"
         )
     elif theirs > 1 and pair.options.pan_band == 1:
-        yield (
-            f"PAN has {theirs} bands, and the first ({reference.band_names[0]}) was matched on: is "
-            "it the right one? `pan_band=N` takes another"
-        )
+        yield first_of_many(pair)
+
+
+def first_of_many(pair: Pair) -> str:
+    """The question whether the first band of PAN is the one that was meant."""
+    names = pair.reference.band_names
+    return (
+        f"PAN has {len(names)} bands, and the first ({names[0]}) was matched on: is it the right "
+        "one? `pan_band=N` takes another, `pan_band=0` the one most like the others"
+    )
 
 
 def _doubts_of_place(pair: Pair, points: TiePoints) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import rasterio
 
 import geodelreg
@@ -32,6 +33,34 @@ def test_a_reference_of_many_bands_is_asked_about_unless_one_was_named() -> None
     (question,) = questions(MS, MS)
     assert "`pan_band=N`" in question
     assert questions(MS, MS, pan_band=2) == []
+
+
+def test_of_a_reference_of_many_bands_the_one_most_like_the_others_is_taken(tmp_path: Path) -> None:
+    pan = tmp_path / "pan.tif"
+    with rasterio.open(PAN) as raster:
+        image, profile = raster.read(1), raster.profile
+    noise = np.random.default_rng(0).normal(0, image.std(), (3, *image.shape))
+    layers = [noise[0] + image.mean(), image + noise[1] / 4, image, image + noise[2] / 4]
+    with rasterio.open(pan, "w", **profile | {"count": 4}) as out:
+        out.write(np.clip(np.stack(layers), 0, 65535).astype(profile["dtype"]))
+    alignment = geodelreg.align(MS, pan, pan_band=0)
+    (said,) = (note for note in alignment.warnings if "PAN has" in note)
+    assert "band 3" in said
+    assert alignment.options.pan_band == 3
+    alone = geodelreg.align(MS, PAN, pan_band=0)
+    assert alone.options.pan_band == 1
+    assert not any("PAN has" in note for note in alone.warnings)
+
+
+def test_the_first_band_is_not_asked_about_when_it_was_chosen(tmp_path: Path) -> None:
+    pan = tmp_path / "pan.tif"
+    with rasterio.open(PAN) as raster:
+        image, profile = raster.read(1), raster.profile
+    with rasterio.open(pan, "w", **profile | {"count": 2}) as out:
+        out.write(np.stack([image, image]))
+    (said,) = (n for n in geodelreg.align(MS, pan, pan_band=0).warnings if "PAN has" in n)
+    assert "band 1" in said
+    assert "?" not in said
 
 
 def test_a_wrong_zone_is_asked_about_with_the_distance(tmp_path: Path) -> None:

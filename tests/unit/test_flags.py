@@ -69,4 +69,5 @@ def test_the_command_line_shows_flags(message: str, typed: str) -> None:
 def test_arguments_of_what_is_on_off_or_many() -> None:
     assert arguments("north_up", True) == ["--north-up"]
     assert arguments("north_up", False) == []
+    assert arguments("pan_band", 0) == ["--pan-band", "auto"]
     assert arguments("masks", ("a.tif", "b c.tif=3")) == ["--mask", "a.tif", "--mask", "b c.tif=3"]
