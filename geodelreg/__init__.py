@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from geodelreg.applying import apply
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.check import Check
+    from geodelreg.report.candidate import write_candidate
     from geodelreg.report.output import write_report
     from geodelreg.sharpen import pansharpen
     from geodelreg.sharpen_options import PansharpenOptions
@@ -47,6 +48,7 @@ __all__ = [
     "refit",
     "revert",
     "write",
+    "write_candidate",
     "write_displacement",
     "write_in_place",
     "write_report",
@@ -67,6 +69,7 @@ _HOMES = {
     "refit": "geodelreg.api",
     "revert": "geodelreg.writing",
     "write": "geodelreg.writing",
+    "write_candidate": "geodelreg.report.candidate",
     "write_displacement": "geodelreg.writing",
     "write_in_place": "geodelreg.writing",
     "write_report": "geodelreg.report.output",

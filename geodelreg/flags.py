@@ -34,6 +34,7 @@ FLAGS = {
     "export_gcps": ("--gcps",),
     "write_displacement": ("--displacement",),
     "write_report": ("--report",),
+    "write_candidate": ("--keep-candidate",),
 }
 """Flags that GDAL's users know by another name than the knob's, or that are functions in Python."""
 _OPTIONS = (AlignOptions, WriteOptions, BatchOptions, PansharpenOptions)

@@ -42,6 +42,7 @@ class Request:
     displacement: Path | None
     figure: Path | None
     figure_kind: str
+    candidate: Path | None
     json: bool
     quiet: bool
     options: AlignOptions
@@ -133,6 +134,14 @@ def output_params() -> list[SectionOption]:
             "report extra). - is stdout.",
         ),
         kind_option("--figure-kind", OUTPUT),
+        flag(
+            "--keep-candidate",
+            type=FILE,
+            metavar="FOLDER",
+            section=OUTPUT,
+            help="When refused, keep what was refused there: correction, tie points and figure, in "
+            "files named refused_candidate.",
+        ),
         flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
     ]
 
@@ -178,6 +187,7 @@ def request_of(
         displacement=given["displacement"],
         figure=given["figure"],
         figure_kind=given["figure_kind"],
+        candidate=given["keep_candidate"],
         json=given["json"],
         quiet=given["quiet"],
         options=options,
@@ -201,6 +211,7 @@ def check_outputs(request: Request) -> list[Path]:
     """
     from geodelreg.geotiff.atomic import tidy
     from geodelreg.geotiff.targets import STDOUT, Inputs
+    from geodelreg.report.candidate import candidate_files
     from geodelreg.report.output import check_report
     from geodelreg_cli.outputs import check_gcp_formats, check_targets, raster_targets
 
@@ -227,6 +238,9 @@ def check_outputs(request: Request) -> list[Path]:
             request.output if len(request.sources) > 1 or apart else None,
             rasters,
         )
+        if request.candidate is not None:
+            kept, overwrite = candidate_files(request.candidate), request.write_options.overwrite
+            check_targets([*inputs, *map(str, written)], kept, overwrite, request.candidate)
         for path in request.reports:
             check_report(path)
         if request.figure is not None:
@@ -263,6 +277,7 @@ def run(request: Request, find: Callable[[Progress], Alignment]) -> None:
             log_timings(refusal.alignment)
             if not request.quiet:
                 click.echo(_step_counts(refusal.alignment), err=True)
+            _keep_candidate(refusal.alignment, request)
         raise
     reports = _reports(alignment, request)  # of the inputs as they are: --in-place changes one
     with together(inputs=lambda: inputs):
@@ -275,6 +290,19 @@ def run(request: Request, find: Callable[[Progress], Alignment]) -> None:
         click.echo(as_typed(summary_text(alignment, request.write_options)), err=True)
         click.echo(_step_counts(alignment), err=True)
         click.echo(shown(_written(request)), err=True)
+
+
+def _keep_candidate(alignment: Alignment, request: Request) -> None:
+    from geodelreg.report.candidate import has_candidate, write_candidate
+
+    if request.candidate is None:
+        return
+    if not has_candidate(alignment):
+        logging.getLogger(__name__).warning("warning: nothing was found that could be kept")
+        return
+    files = write_candidate(alignment, request.candidate, request.write_options.overwrite)
+    if not request.quiet:
+        click.echo(shown(f"Kept, though refused: {', '.join(map(str, files))}"), err=True)
 
 
 def _named(request: Request) -> str:
