@@ -114,8 +114,11 @@ def check(rasters: tuple[str, ...], **given: Any) -> int:
 def _show(found: Check, given: dict[str, Any]) -> None:
     """Warnings on stderr, then the report or the text on stdout."""
     from geodelreg.product.check import check_json, check_text
+    from geodelreg.values.remedies import ROTATES
 
     for warning in found.alignment.warnings:
+        if warning == ROTATES:
+            continue  # nothing is written
         logging.getLogger(__name__).warning("warning: %s", warning)
     if given["json"]:
         click.echo(check_json(found))

@@ -333,6 +333,7 @@ def _step_counts(alignment: Alignment) -> str:
 def _write(alignment: Alignment, request: Request) -> None:
     """Write the raster, then the control points."""
     import geodelreg
+    from geodelreg.values.remedies import ROTATES
 
     overwrite = request.write_options.overwrite
     warnings: list[str] = []
@@ -341,6 +342,8 @@ def _write(alignment: Alignment, request: Request) -> None:
     elif request.output is not None:
         warnings = geodelreg.write(alignment, request.output, request.write_options)
     for warning in (*alignment.warnings, *warnings):
+        if warning == ROTATES and carries_all(request.write_options):
+            continue  # OUT is resampled, or has control points
         logging.getLogger(__name__).warning("warning: %s", warning)
     if request.displacement is not None:
         geodelreg.write_displacement(alignment, request.displacement, overwrite)

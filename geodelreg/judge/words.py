@@ -14,6 +14,7 @@ from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
+from geodelreg.values.remedies import ROTATES
 from geodelreg.values.result import BandMap
 
 _LOCAL_SIGNIFICANCE = 3.0
@@ -55,10 +56,7 @@ def warnings_of(
     if without_bright:
         notes.append("bright objects (clouds?) move differently from the ground and were left out")
     if model in ("similarity", "affine"):
-        notes.append(
-            "the correction rotates the raster: its geotransform is no longer north-up, which "
-            "GDAL's pansharpening and gdalbuildvrt refuse"
-        )
+        notes.append(ROTATES)
     local = local_distortion(points)
     if local > LOCAL_RMS_PX:
         notes.append(

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
 
+ROTATES = (
+    "the correction rotates the raster: its geotransform is no longer north-up, which GDAL's "
+    "pansharpening and gdalbuildvrt refuse"
+)
+"""A warning for whom a corrected header is written."""
 _REMEDIES = (
     (
         {"local"},

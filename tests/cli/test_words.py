@@ -135,3 +135,20 @@ def test_figure_without_matplotlib_is_refused_before_the_work(pair: Path) -> Non
     assert "figures need matplotlib" in done.stderr
     assert "pip install '.[report]'" in done.stderr
     assert sorted(snapshot(pair)) == ["ms.tif", "pan.tif"]
+
+
+@pytest.mark.parametrize(
+    ("args", "warned"),
+    [
+        (("align", "--dry-run"), True),
+        (("align", "-o", "out.tif", "--warp"), False),
+        (("align", "-o", "out.tif", "--georef", "gcps"), False),
+        (("check",), False),
+    ],
+)
+def test_a_rotated_header_is_warned_of_where_one_is_written(
+    geodelreg: Command, pair: Path, args: tuple[str, ...], warned: bool
+) -> None:
+    done = geodelreg(args[0], "ms.tif", "pan.tif", *args[1:], "--model", "affine", cwd=pair)
+    assert ("no longer north-up" in done.stderr) == warned
+    assert "--warp" not in done.stderr or warned
