@@ -345,6 +345,7 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
     Too few patches leave what was found.
     """
     from geodelreg.fine.settle import settle
+
     guess, refined, fitted = found
     with pair.timings("field"):
         settled = settle(refined, whole.field or fitted.map)

@@ -165,8 +165,9 @@ def test_a_place_where_much_is_missing_is_none_of_the_three() -> None:
     residual[far] = 9.0
     every = patches(residual, far)
     there = ~((x > 0.45) & (y > 0.45)) | far  # no data, but for a scrap in the corner
-    given = {field.name: getattr(every, field.name)[there] for field in fields(every)}
-    made = alignment(tie_points=TiePoints(**given))
+    given = {field.name: getattr(every, field.name) for field in fields(every)}
+    kept = {name: values[there] for name, values in given.items() if values is not None}
+    made = alignment(tie_points=TiePoints(**kept))
     for place in places(made.tie_points, frame_of(made)):
         low = np.array(place.window[:2])
         at = every.reference_px
