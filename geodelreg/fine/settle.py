@@ -32,6 +32,9 @@ _STANDS_STILL = 0.2  # of its standard error; unexplained: ablate
 _TONE_TILES = 120  # of a hundred samples each: weights of bands are then known to a percent
 _STEEP = 4.0
 """Patches within which the residual varies, below which smaller ones are tried."""
+_FLATTENED = (25 + 25 + 2 * 25 / 3) ** 0.5 / 24
+"""Of a Matérn 5/2 field of unit variance and range, RMS of what its mean over a unit square hides:
+1/24, the square's second moment, times the Laplacian, whose variance that is."""
 _NOISY = 2.0
 """Scatter over the patches' own errors, above which it may be variation within them."""
 _TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
@@ -169,12 +172,18 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
 
 
 def _bends(settled: Settled) -> bool:
-    """True when the field varies within few patches, or what looks like noise may be the field."""
-    kernel = settled.fit.field.kernel
+    """True when smaller patches may tell more.
+
+    The field varies within few patches, or their means hide more of it than they are uncertain, or
+    what looks like noise may be the field.
+    """
+    kernel, size = settled.fit.field.kernel, settled.refined.size
     covariance = settled.points.covariance[settled.ground]
     own = float(np.median(covariance.trace(axis1=1, axis2=2))) / 2
-    steep = max(kernel.variance_px2) > own and kernel.range_px < _STEEP * settled.refined.size
-    return steep or kernel.nugget_px2 > _NOISY**2 * own
+    variance = max(kernel.variance_px2)
+    steep = variance > own and kernel.range_px < _STEEP * size
+    hidden = _FLATTENED * variance**0.5 * (size / kernel.range_px) ** 2
+    return steep or hidden > own**0.5 or kernel.nugget_px2 > _NOISY**2 * own
 
 
 def _unknown(settled: Settled) -> float:
