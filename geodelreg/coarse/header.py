@@ -18,7 +18,7 @@ from geodelreg.fine.overlay import overlay
 from geodelreg.fine.passes import COARSE_SIGMA
 from geodelreg.fine.surface import make_surface
 from geodelreg.fine.tiles import Tile, overview_tile
-from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, decimation, fit_tone
+from geodelreg.fine.tuning import Tuning, decimation, fit_tone
 from geodelreg.fit.chance import log_nfa
 from geodelreg.fit.models import points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY, AffineMap
@@ -70,8 +70,7 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
     part = roles(pair)
     tile = overview_tile(part, images)
     near = guess.map
-    # of full resolution's usual sharpness: the point spread is fitted with this tone
-    tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], near, DEFAULT_SIGMA, _TONE_SAMPLES))
+    tuning = Tuning(COARSE_SIGMA, fit_tone(part, [tile], near, COARSE_SIGMA, _TONE_SAMPLES))
     for options in (MatchOptions(tolerance=ROUGH_STEP), MatchOptions()):
         found = match_pass(part, [tile], near, tuning, options)
         if found.estimate is None:

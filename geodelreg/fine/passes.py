@@ -133,6 +133,8 @@ def refine_proven(part: Roles, images: Overview, tuning: Tuning, proof: Pass) ->
     (tiles, size), near, last = read, proof.estimate.map, proof
     options, some = MatchOptions(size=size), _some_of(tiles)
     agreed = proof.matched.template_px[proof.status == Status.KEPT]
+    # a tone fitted at another sharpness, as the proof's was, draws the point spread towards that
+    tuning = replace(tuning, tone=fit_tone(part, some, near, DEFAULT_SIGMA, _FEWER_SAMPLES))
     tuning = replace(tuning, sigma=fit_sigma(part, some, near, agreed, tuning, size))
     if proof.kept < _MANY_PATCHES or _are_coarse(part, overview_tile(part, images)):
         last = match_pass(part, some, near, tuning, options)

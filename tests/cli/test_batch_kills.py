@@ -138,10 +138,10 @@ def test_an_interrupted_batch_leaves_no_process_and_no_debris(
     folder: Path, geodelreg: Command, expected: dict[str, bytes], number: signal.Signals, code: int
 ) -> None:
     driver = start("batch", "pairs.csv", "-j", "2", cwd=folder)
-    wait_until(lambda: finished(folder) >= 1)
+    wait_until(lambda: len(children_for_pairs(driver.pid)) == 2)
     below = descendants(driver.pid)
-    assert below
-    os.kill(driver.pid, number)
+    wait_until(lambda: finished(folder) >= 1)
+    os.kill(driver.pid, number)  # at once: the others are soon done, too
     _, stderr = driver.communicate(timeout=60)
     assert driver.returncode == code
     assert stderr.splitlines()[-1] == f"geodelreg: {'interrupted' if code == 130 else 'terminated'}"

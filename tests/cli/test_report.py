@@ -196,7 +196,7 @@ def test_a_result_of_other_rasters_is_refused(
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda report: report | {"schema_version": "1.0"},
+        lambda report: report | {"schema_version": "3.0"},
         lambda report: report | {"found": {"model": "shift"}},
         lambda report: report | {"options": report["options"] | {"method": "magic"}},
         lambda report: [report],

@@ -162,7 +162,7 @@ def test_check_shares_the_estimate_and_searches_once(
     for band, other in zip(found.bands, said, strict=True):
         assert np.abs(np.subtract(band.shift_px, other["shift_px"])).max() < 1e-9
         assert band.sigma_px == other["sigma_px"]
-        assert 0.5 < band.correlation <= 1
+        assert 0.4 < band.correlation <= 1  # infrared shows half of what PAN does
     assert found.raster_outcome.value == "cannot_tell"
     assert "PAN px at least between the places of two MS bands" in found.reason
 
