@@ -1,7 +1,8 @@
 """KARIOS: its KLT matcher with its own configuration, and an affine or a field through the points.
 
 It wants two images of one grid, so PAN is brought to that of MS (default: averaged), or both to
-PAN's size (expert).  Large shifts are found first, as its ``--enable-large-shift-detection`` does.
+PAN's size (expert).  It runs without and with its detection of large shifts; what more points agree
+on is taken.
 """
 
 from __future__ import annotations
@@ -29,12 +30,10 @@ from karios.core.configuration import ProcessingConfiguration
 from karios.core.image import GdalRasterImage
 from karios.matcher.klt import KLT
 from karios.matcher.large_offset import LargeOffsetMatcher
-from scattered import affine_without_outliers, smooth_field
+from scattered import affine_without_outliers, agreeing, smooth_field
 
 CONFIDENCE = 0.4
 """Points that score less are left out, as ``accuracy_analysis.confidence_threshold``."""
-LARGE_SHIFT_PX = 2
-"""As ``shift_image_processing.bias_correction_min_threshold``."""
 
 
 def _written(path: Path, image: np.ndarray, transform: Affine) -> GdalRasterImage:
@@ -54,19 +53,23 @@ def _points(folder: Path, grey: np.ndarray, pan: np.ndarray, zoom: int) -> list[
     klt = ProcessingConfiguration.from_file(str(settings)).klt_configuration
     here, there = to_uint8(grey), to_uint8(pan)
     scale = Affine.scale(1.0, -1.0)
+    coarse = [
+        _written(folder / f"coarse{i}.tif", np.ascontiguousarray(image[::zoom, ::zoom]), scale)
+        for i, image in enumerate((here, there))
+    ]
+    # at MS size: magnified MS has nothing but noise above its Nyquist frequency
+    large = np.round(LargeOffsetMatcher(*coarse).match()[::-1]) * zoom
     reference = _written(folder / "reference.tif", here, scale)
-    offset = np.zeros(2)
-    monitored = _written(folder / "monitored.tif", there, scale)
-    large = np.round(LargeOffsetMatcher(reference, monitored).match()[::-1])
-    if np.abs(large).max() > LARGE_SHIFT_PX:
-        offset = np.asarray(large, dtype=float)
-        moved = np.roll(there, -large.astype(int)[::-1], axis=(0, 1))
-        monitored = _written(folder / "moved.tif", moved, scale)
-    table = next(iter(KLT(klt).match(monitored, reference, None)))
-    table = table[table["score"] >= CONFIDENCE]
-    source = table[["x0", "y0"]].to_numpy(float)
-    target = source + table[["dx", "dy"]].to_numpy(float) + offset
-    return [(place + 0.5) / zoom for place in (source, target)]
+    found = []
+    for offset in (np.zeros(2), large):
+        moved = np.roll(there, -offset.astype(int)[::-1], axis=(0, 1))
+        monitored = _written(folder / "monitored.tif", moved, scale)
+        for table in KLT(klt).match(monitored, reference, None):
+            kept = table[table["score"] >= CONFIDENCE]
+            source = kept[["x0", "y0"]].to_numpy(float)
+            target = source + kept[["dx", "dy"]].to_numpy(float) + offset
+            found.append([(place + 0.5) / zoom for place in (source, target)])
+    return max(found, key=lambda points: agreeing(*points))
 
 
 def _matched(folder: Path, pair: Pair, pan: np.ndarray, zoom: int) -> list[FloatArray]:

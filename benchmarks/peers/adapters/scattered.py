@@ -14,14 +14,25 @@ SMOOTHING = 1.0
 
 
 def affine_without_outliers(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(2, 3) by least squares, points beyond 2.5 median distances left out, five times."""
+    """(2, 3) by least squares, five times, points beyond 2.5 median distances left out.
+
+    The first distances are from the median shift, which half of the points may miss.
+    """
     design = np.column_stack([source, np.ones(len(source))])
+    matrix = np.vstack([np.eye(2), np.median(target - source, axis=0)])
     kept = np.ones(len(source), dtype=bool)
     for _ in range(ROUNDS):
-        matrix = np.linalg.lstsq(design[kept], target[kept], rcond=None)[0]
         distance = np.hypot(*(design @ matrix - target).T)
         kept = distance < max(SMALLEST_LIMIT_PX, OUTLIER_MEDIANS * float(np.median(distance[kept])))
+        matrix = np.linalg.lstsq(design[kept], target[kept], rcond=None)[0]
     return np.asarray(matrix.T)
+
+
+def agreeing(source: FloatArray, target: FloatArray) -> int:
+    """Points within a pixel of the affine through them."""
+    linear = affine_without_outliers(source, target)
+    off = source @ linear[:, :2].T + linear[:, 2] - target
+    return int((np.hypot(*off.T) < 1.0).sum())
 
 
 def smooth_field(source: FloatArray, target: FloatArray, at: FloatArray) -> FloatArray:
