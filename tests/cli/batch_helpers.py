@@ -54,11 +54,18 @@ def query(ledger: Path, sql: str) -> list[tuple[Any, ...]]:
 
 
 def start(*args: object, cwd: Path) -> subprocess.Popen[str]:
-    """``geodelreg ARGS`` in the background."""
-    return subprocess.Popen(
-        [*COMMAND, *map(str, args)], cwd=cwd, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    """``geodelreg ARGS`` in the background, where Ctrl-C reaches it.
+
+    A shell's background jobs ignore SIGINT, and so would what they start: the tests, and this.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [*COMMAND, *map(str, args)], cwd=cwd, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def wait_until(true: Callable[[], object], seconds: float = 60.0) -> None:

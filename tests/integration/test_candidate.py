@@ -30,7 +30,8 @@ def test_the_command_keeps_what_was_refused(accepted: geodelreg.Alignment, tmp_p
     assert {path.suffix for path in folder.iterdir()} == {".json", ".geojson", ".png"}
     told = json.loads((folder / "refused_candidate.json").read_text("utf-8"))
     expected = accepted.correction.corrected.to_gdal()
-    assert told["refused_geotransform"] == pytest.approx(expected, abs=0.01)
+    # pixels of 10 m; with the limit the search goes another way
+    assert told["refused_geotransform"] == pytest.approx(expected, abs=0.1)
     assert "PAN px shift" in told["because"][0]
     points = json.loads((folder / "refused_candidate.geojson").read_text("utf-8"))
     assert len(points["features"]) > accepted.accuracy.kept / 2
