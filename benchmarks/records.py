@@ -31,6 +31,14 @@ def resume(path: Path) -> list[Row]:
     return rows
 
 
+def keep(rows: list[Row], row: Row, path: Path) -> None:
+    """Add a row to those that `resume` gave and to their file, and print it."""
+    rows.append(row)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+    print(row, flush=True)
+
+
 def save(path: Path, rows: Iterable[Any]) -> None:
     """Write rows, dataclasses, as one JSON list."""
     path.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")

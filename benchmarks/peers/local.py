@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.accuracy.field import TEXTURES, Case, make, run_case
 from benchmarks.gate.bent_cases import BentPair
-from benchmarks.peers.run import CACHE, TIMEOUT_S, Tool, attempt, available_tools
-from benchmarks.records import Row, resume
+from benchmarks.peers.run import Tool, add_tool_arguments, attempt, available_tools, named
+from benchmarks.records import Row, keep, resume
 from benchmarks.report import machine, replace_section
 from benchmarks.scenes.make import write_scene
 from benchmarks.scenes.truth import check_points
@@ -79,26 +79,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks peers-local``."""
     parser.add_argument("--data", type=Path, required=True, help="folder with the real imagery")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines; a run continues them")
-    parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds a run may take")
-    parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
-    parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+    add_tool_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Every tool on every case, one after the other."""
     rows = resume(args.out)
     done = {(row["case"], row["tool"]) for row in rows}
-    tools = list(available_tools(args.envs, set(filter(None, args.peers.split(","))), local=True))
+    tools = list(available_tools(args.envs, named(args.peers), local=True))
     for case in CASES:
         todo = [tool for tool in tools if (case.name, tool.name) not in done]
         pair = make(case, TEXTURES[case.texture](args.data)) if todo else None
         for tool in todo:
             assert pair is not None
-            rows.append(run_local(tool, case, pair, args.timeout))
-            print(rows[-1], flush=True)
-            with args.out.open("a") as file:
-                file.write(json.dumps(rows[-1]) + "\n")
+            keep(rows, run_local(tool, case, pair, args.timeout), args.out)
     if args.docs:
         about = _ABOUT.format(machine=machine(), limit=args.timeout)
         replace_section(args.docs, "peers-local", f"{about}\n\n{table(rows)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import shutil
 import tempfile
@@ -13,8 +12,8 @@ import rasterio
 
 from benchmarks.accuracy.real_pairs import PAIRS, Pair, measure_pair
 from benchmarks.peers.environments import OWN
-from benchmarks.peers.run import CACHE, TIMEOUT_S, Tool, attempt, available_tools
-from benchmarks.records import Row, read_transform, resume
+from benchmarks.peers.run import Tool, add_tool_arguments, attempt, available_tools, named
+from benchmarks.records import Row, keep, read_transform, resume
 from benchmarks.report import machine, replace_section
 
 EXTRA = (
@@ -80,17 +79,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with the real pairs")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines; a run continues them")
     parser.add_argument("--only", default="", help="pairs, comma-separated")
-    parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds a run may take")
-    parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
-    parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+    add_tool_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Every tool on every pair that is there."""
     rows = resume(args.out)
     done = {(row["pair"], row["tool"], row["setting"]) for row in rows}
-    wanted, only = (set(filter(None, text.split(","))) for text in (args.only, args.peers))
+    wanted, only = map(named, (args.only, args.peers))
     tools = list(available_tools(args.envs, only))
     for pair in (*PAIRS, *EXTRA):
         there = all((args.data / name).exists() for name in (pair.ms, pair.pan))
@@ -99,18 +95,11 @@ def run(args: argparse.Namespace) -> int:
         if (pair.name, BEFORE, "") not in done:
             found = measure_pair(pair, args.data)
             before = {"off_px": found.distance_px, "radial_px": found.radial_px}
-            _keep(rows, {"pair": pair.name, "tool": BEFORE, "setting": ""} | before, args.out)
+            keep(rows, {"pair": pair.name, "tool": BEFORE, "setting": ""} | before, args.out)
         for tool in tools:
             if (pair.name, tool.name, tool.setting) not in done:
-                _keep(rows, run_pair(tool, pair, args.data, args.timeout), args.out)
+                keep(rows, run_pair(tool, pair, args.data, args.timeout), args.out)
     if args.docs:
         about = _ABOUT.format(machine=machine(), limit=args.timeout)
         replace_section(args.docs, "peers-real", f"{about}\n\n{table(rows)}")
     return 0
-
-
-def _keep(rows: list[Row], row: Row, out: Path) -> None:
-    rows.append(row)
-    with out.open("a") as file:
-        file.write(json.dumps(row) + "\n")
-    print(row, flush=True)

@@ -131,6 +131,19 @@ def available_tools(cache: Path, only: set[str], local: bool = False) -> Iterato
             yield Tool(peer.name, setting, python, ADAPTERS / f"{peer.script}.py")
 
 
+def add_tool_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments that all commands with peers have."""
+    parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
+    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds a run may take")
+    parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
+    parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+
+
+def named(text: str) -> set[str]:
+    """Names between commas."""
+    return set(filter(None, text.split(",")))
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``python -m benchmarks peers``."""
     parser.add_argument("--scenes", type=Path, required=True, help="folder that `scenes` wrote")
@@ -138,18 +151,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, help="JSON file for the results; a run continues it"
     )
     parser.add_argument("--only", default="", help="scenes, comma-separated")
-    parser.add_argument("--peers", default="", help="adapters, comma-separated; 'none': geodelreg")
     parser.add_argument("--quick", action="store_true", help="scenes A, C and G only")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each, the fastest counts")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds a run may take")
-    parser.add_argument("--envs", type=Path, default=CACHE, help="folder of the environments")
-    parser.add_argument("--docs", type=Path, help="page whose section is replaced")
+    add_tool_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run every tool on every scene, one after the other, and write the results."""
-    tools = list(available_tools(args.envs, {name for name in args.peers.split(",") if name}))
-    wanted = {name for name in args.only.split(",") if name}
+    tools = list(available_tools(args.envs, named(args.peers)))
+    wanted = named(args.only)
     wanted = wanted or (set(QUICK_SCENES) if args.quick else set())
     host, results = machine(), []
     if args.out.exists():

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from common import FloatArray, arguments, read_pair, save_pixel_match, to_uint8
+from common import PIXEL_SIGMA, FloatArray, arguments, read_pair, save_pixel_match, to_uint8
 
 KEYPOINTS, RATIO, MAGSAC_PX = 8000, 0.8, 1.0
-PIXEL_SIGMA = 0.45
 TURNS = 2
 CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-8)
 
