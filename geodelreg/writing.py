@@ -228,7 +228,7 @@ def export_gcps(
     """
     from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import (
-        WITH_FIELDS,
+        GCP_FORMATS,
         format_of,
         gcp_context,
         gcps_from_alignment,
@@ -239,7 +239,7 @@ def export_gcps(
     if points not in ("kept", "all"):
         raise UsageError(f"`points={points!r}` is unknown", "Use one of: kept, all.")
     every = points == "all"
-    by_band = format_of(Path(path), format) in WITH_FIELDS
+    by_band = GCP_FORMATS[format_of(Path(path), format)].has_fields
     gcps = gcps_from_alignment(alignment, every, bands=by_band)
     context = gcp_context(alignment, every)
     with together(inputs=lambda: inputs_of(alignment)):

@@ -45,7 +45,7 @@ WRITE_OPTIONS: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 GCP_EXTENSIONS = {
     "qgis": ".points", "gdal": ".gcp", "csv": ".csv", "geojson": ".geojson", "vrt": ".vrt",
-    "envi": ".pts", "envi-map": ".txt",
+    "envi": ".pts", "envi-map": ".txt", "gpkg": ".gpkg", "flatgeobuf": ".fgb",
 }  # fmt: skip
 ACTIONS = (
     *["write"] * 7, *["inplace"] * 6, *["align"] * 3, *["check"] * 3, *["gcps"] * 4, *["revert"] * 2

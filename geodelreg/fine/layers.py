@@ -1,8 +1,9 @@
 """What moves together: which pixels are the ground, and which are clouds, relief or other layers.
 
-Every rule that tells ground from clouds is here, in the order in which a pair meets them: bright
-objects, keypoints of the dark areas, patches of one pass, the ground against everything, the mesh,
-and what speaks against a correction in the end.
+The rules of the search are here, in the order in which a pair meets them: bright objects, keypoints
+of the dark areas, patches of one pass, the ground against everything, the mesh, and what speaks
+against a correction in the end.  What all patches of a found correction say is `fine/ground.py`'s:
+`fine/motions.py` cuts them into motions, `fine/clouds.py` says which of these are clouds.
 """
 
 from __future__ import annotations

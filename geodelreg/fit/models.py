@@ -4,8 +4,8 @@ A model M turns the geotransform G into G ∘ M.  ``shift`` and ``scale`` (shift
 keep a north-up raster north-up; ``similarity`` is one on the ground, whatever the pixel's shape.
 ``projective`` is no affine: no geotransform holds it, and `auto` never takes it.
 
-A new model is a branch of `design` and of `fitted_map`, with its name in `PARAMETER_COUNT` and in
-`geodelreg.options.MODELS`.
+A new model is a branch of `design` and of `fitted_map`, with its name in `PARAMETER_COUNT`;
+CONTRIBUTING lists what else knows models by name.
 """
 
 from __future__ import annotations

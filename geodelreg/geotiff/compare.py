@@ -16,6 +16,8 @@ from geodelreg.geo.affine import affine_matrix
 from geodelreg.geotiff.header import Provenance
 from geodelreg.geotiff.metadata import attribute, colormap, lost_metadata
 
+EXACT_PX = 1e-6
+"""Displacement of a corner that rounding of a geotransform in float64 explains."""
 _WINDOW_BYTES = 16_000_000
 _ATTRIBUTES = {
     "nodatavals": "no-data values",
@@ -34,7 +36,7 @@ _ENCODING = {
 
 
 def check_placement(
-    out: Path | str, target: Path, content: Provenance, tolerance_px: float
+    out: Path | str, target: Path, content: Provenance, tolerance_px: float = EXACT_PX
 ) -> None:
     """Read back through GDAL where the output lies.
 

@@ -27,7 +27,6 @@ from geodelreg.tiff import is_tiff
 from geodelreg.values.points import Gcp
 from geodelreg.values.result import Correction
 
-_EXACT_PX = 1e-6
 _REWRITTEN_PX = 1e-4
 """Some formats keep georeferencing as text."""
 
@@ -82,7 +81,7 @@ def write_corrected(
             if _is_copied(source, target, options):
                 copy_with_header(source, out, content)
                 notes = sidecars.carry(source, out, options.strip_rpc)
-                tolerance_px, copied = _EXACT_PX, True
+                tolerance_px, copied = compare.EXACT_PX, True
             else:
                 notes = rewrite(source, out, target, content, options)
                 tolerance_px, copied = _REWRITTEN_PX, False
@@ -118,7 +117,6 @@ def _is_copied(source: Path, target: Path, options: WriteOptions) -> bool:
 
 
 def _losses(source: Path, out: Path, content: Provenance, copied: bool) -> list[str]:
-
     lost = compare.metadata_differences(source, out, copied, content.strip_rpc)
     notes = [f"{source.name}: not kept in the output: {what}" for what in lost]
     with open_raster(out) as dataset:

@@ -1,4 +1,4 @@
-"""GDAL's settings while product reads and writes rasters."""
+"""GDAL's settings while outputs are read and written."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """The header of a TIFF corrected where it lies, whatever the size of the file.
 
-A new directory is appended and flushed to the disk, then the pointer to it is replaced in one
-write: killed at any moment, the file reads as before or as after.  GDAL's own edit passes through
-states that cannot be read.
+The edit is planned, tried on a preview and kept on record here; `undo.Edit.apply` makes it: a new
+directory is appended and flushed to the disk, then the pointer to it is replaced in one write.
+Killed at any moment, the file reads as before or as after.  GDAL's own edit passes through states
+that cannot be read.
 """
 
 from __future__ import annotations
@@ -37,7 +38,6 @@ from geodelreg.values.result import Correction
 
 logger = logging.getLogger(__name__)
 
-_EXACT_PX = 1e-6
 _TO_OUT = "Write the result to another file (`write`)."
 
 
@@ -196,7 +196,7 @@ def _planned(path: Path, raster: Path, file: BinaryIO, content: Provenance) -> E
     )
     reference = georeference.reference_with_sidecars
     with _preview(raster, edit, tiff.layout.header_bytes) as name:
-        compare.check_placement(name, path, content, _EXACT_PX)
+        compare.check_placement(name, path, content)
         if reference is not None and reference.is_same(spatial_reference(name)):
             reference = None
     if reference is not None and not is_kept_in_pam(reference):

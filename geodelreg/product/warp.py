@@ -41,7 +41,6 @@ TOLERANCE_PX = 1e-3
 
 _SNAP_PX = 1e-6
 _EDGE_PLACES = 64  # on each edge of a footprint: what bends curves it
-_EXACT_PX = 1e-6
 _RASTERIO_NAMES = {"cubicspline": "cubic_spline"}
 """Of resamplings whose name in rasterio is not GDAL's."""
 
@@ -139,7 +138,7 @@ def write_warped(
             settled = Correction(correction.model, grid.crs_wkt, grid.transform, grid.transform)
             content = Provenance(settled, (), tags)
             kept = keep(onto, draft, target)
-            compare.check_placement(draft, target, content, _EXACT_PX)
+            compare.check_placement(draft, target, content)
             if driver != "GTiff":
                 notes += rewrite(draft, out, target, content, options)
                 kept = keep(onto, out, target)

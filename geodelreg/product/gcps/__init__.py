@@ -50,7 +50,17 @@ _LARGEST_BYTES = 50_000_000
 class GcpFormat:
     """One file format: its extensions (the first format that names one is its default).
 
-    What is no text is read by its path.
+    Attributes
+    ----------
+    extensions : tuple of str
+    description : str
+    encode, decode : callable
+    is_text : bool
+        False of what is read by its path.
+    has_fields : bool
+        Each point tells its status, its accuracy, and the band it belongs to.
+    keeps_rejected : bool
+        Points can say that they were rejected.
     """
 
     extensions: tuple[str, ...]
@@ -58,20 +68,29 @@ class GcpFormat:
     encode: Encoder
     decode: Decoder
     is_text: bool = True
+    has_fields: bool = False
+    keeps_rejected: bool = False
 
 
 GCP_FORMATS = {
-    "qgis": GcpFormat((".points",), "QGIS georeferencer", qgis.encode, qgis.decode),
+    "qgis": GcpFormat(
+        (".points",), "QGIS georeferencer", qgis.encode, qgis.decode, keeps_rejected=True
+    ),
     "gdal": GcpFormat((".gcp", ".txt"), "gdal_translate --optfile", optfile.encode, optfile.decode),
-    "csv": GcpFormat((".csv",), "gdal raster edit --gcp @FILE", table.encode, table.decode),
+    "csv": GcpFormat(
+        (".csv",), "gdal raster edit --gcp @FILE", table.encode, table.decode, has_fields=True
+    ),
     "geojson": GcpFormat(
-        (".geojson", ".json"), "GeoJSON, as rio gcps", geojson.encode, geojson.decode
+        (".geojson", ".json"), "GeoJSON, as rio gcps", geojson.encode, geojson.decode,
+        has_fields=True, keeps_rejected=True,
     ),
     "gpkg": GcpFormat(
-        (".gpkg",), "GeoPackage", vector.encode_geopackage, vector.decode, is_text=False
+        (".gpkg",), "GeoPackage", vector.encode_geopackage, vector.decode,
+        is_text=False, has_fields=True, keeps_rejected=True,
     ),
     "flatgeobuf": GcpFormat(
-        (".fgb",), "FlatGeobuf", vector.encode_flatgeobuf, vector.decode, is_text=False
+        (".fgb",), "FlatGeobuf", vector.encode_flatgeobuf, vector.decode,
+        is_text=False, has_fields=True, keeps_rejected=True,
     ),
     "vrt": GcpFormat((".vrt",), "VRT of the source raster with GCPs", vrt.encode, vrt.decode),
     "envi": GcpFormat(
@@ -80,12 +99,7 @@ GCP_FORMATS = {
     "envi-map": GcpFormat(
         (), "ENVI image to map", envi.encode_image_to_map, envi.decode_image_to_map
     ),
-}
-
-
-WITH_FIELDS = ("geojson", "csv", "gpkg", "flatgeobuf")
-"""They tell which band a point belongs to."""
-_WITH_REJECTED = ("qgis", "geojson", "gpkg", "flatgeobuf")
+}  # fmt: skip
 
 
 def gcps_from_alignment(
@@ -185,7 +199,7 @@ def write_gcps(
     target = Path(path)
     name = format_of(target, format)
     chosen = _format(name)
-    if name not in _WITH_REJECTED and not all(gcp.enabled for gcp in gcps):
+    if not chosen.keeps_rejected and not all(gcp.enabled for gcp in gcps):
         raise GcpFormatError(
             f"{target}: the format {name} cannot say which points were rejected",
             "Use QGIS points, GeoJSON, GeoPackage or FlatGeobuf, or leave the rejected ones out "
