@@ -4,62 +4,40 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
-
-import numpy as np
 
 from geodelreg.coarse.guesses import guesses
 from geodelreg.coarse.header import ProvenGuess
 from geodelreg.coarse.scopes import scopes
 from geodelreg.errors import NoOverlapError
+from geodelreg.fine.fitted import Found, fit_patches
 from geodelreg.fine.layers import Claim, on_the_mesh
-from geodelreg.fine.least_squares import Matched
-from geodelreg.fine.matching import patches_log_nfa, tie_points
-from geodelreg.fine.motions import LEAST_SHARE
-from geodelreg.fine.passes import Refinement, refine, refine_proven
-from geodelreg.fit.choice import Fitted, half_disagreement, select_for
-from geodelreg.fit.estimate import student_weight
-from geodelreg.fit.field import facets_of, form_of, halves_apart, selection_of
-from geodelreg.fit.models import Frame, points_that_fix
+from geodelreg.fine.passes import refine, refine_proven
+from geodelreg.fit.field import form_of
 from geodelreg.geo.maps.affine import IDENTITY
-from geodelreg.geo.maps.field import FieldMap
-from geodelreg.geo.maps.tin import TinMap
-from geodelreg.judge.evidence import gather
+from geodelreg.judge.bending import carry
 from geodelreg.judge.verdict import (
-    clouds_in_the_way,
     judge,
     moves_pair,
     nothing_agrees,
     passes,
-    too_few_for_a_field,
     verdict,
 )
-from geodelreg.judge.whole import Whole, look_at_whole
 from geodelreg.judge.words import bands_warning, unheard_bands, warnings_of
-from geodelreg.options import BEYOND_A_HEADER, FOLLOWING, AlignOptions
-from geodelreg.pair import Pair, Progress, make_pair, overlap_corners, roles
-from geodelreg.values.points import NO_TIE_POINTS, Guess, Status, TiePoints
-from geodelreg.values.raster import StatusArray, WindowReader
+from geodelreg.options import FOLLOWING, AlignOptions
+from geodelreg.pair import Pair, Progress, make_pair, roles
+from geodelreg.values.points import NO_TIE_POINTS, Guess
+from geodelreg.values.raster import WindowReader
 from geodelreg.values.result import Accuracy, BandMap, Solution
 from geodelreg.values.timings import Timings
 
 logger = logging.getLogger(__name__)
 
-_FEWEST_POINTS = 4
 _BENT_TRIES = 2  # of the guesses that one affine could not make good
 _OPENED, _FOUND = 0.02, 0.4  # of the progress bar: a guess at how the time divides
 _PARTS = 16  # of it, for the judging of all guesses together
-
-
-class Found(NamedTuple):
-    """What a guess led to: patches around a fitted map."""
-
-    guess: Guess
-    refined: Refinement
-    fitted: Fitted
 
 
 class _Refused(NamedTuple):
@@ -171,8 +149,7 @@ def find(pair: Pair, guess: Guess) -> Found | None:
     from geodelreg.paper.baseline import PaperFit, with_patches
 
     assert isinstance(guess, PaperFit)
-    found = with_patches(pair, guess)
-    return None if found is None else Found(*found)
+    return with_patches(pair, guess)
 
 
 def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
@@ -191,42 +168,8 @@ def find_by_patches(pair: Pair, guess: Guess) -> Found | None:
     return None if fitted is None else Found(guess, refined, fitted)
 
 
-def fit_patches(
-    pair: Pair, guess: Guess, refined: Refinement, status: StatusArray
-) -> Fitted | None:
-    """The map that the kept patches choose; None of too few."""
-    part, last = refined.part, refined.last
-    kept = np.flatnonzero(status == Status.KEPT)
-    points = last.points.take(kept)
-    if len(points) < _FEWEST_POINTS:
-        return None
-    selection = select_for(pair, points)
-    estimate = selection.estimate
-    status[kept[~estimate.inlier]] = Status.RESIDUAL
-    weight = np.full(len(status), np.nan)
-    weight[kept] = student_weight(estimate.distance2)
-    tied = tie_points(part, last.matched, estimate.map, status, weight)
-    halves = points.take(estimate.inlier)
-    apart = half_disagreement(halves, estimate, overlap_corners(part, estimate.map))
-    return Fitted(
-        selection,
-        tied,
-        guess.counts | _patch_counts(last.matched, tied),
-        patches_log_nfa(part, tied, points_that_fix(estimate.model)),
-        pair.pan_px_per_source_px * apart,
-    )
-
-
-def _patch_counts(matched: Matched, tied: TiePoints) -> dict[str, int]:
-    return {
-        "patches": len(tied),
-        "patches matched": int((matched.status == Status.KEPT).sum()),
-        "patches kept": int(tied.kept.sum()),
-    }
-
-
 def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = False) -> Solution:
-    """Gather the evidence for a map, judge it, and say all that is known.
+    """Judge a map, or a better one for all of the ground, and say all that is known.
 
     Parameters
     ----------
@@ -237,34 +180,12 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     bent : bool
         One affine was refused: judge a field.
     """
-    guess, refined, fitted = found
     options = pair.options
-    notes: tuple[str, ...] = ()
-    clouds = 0.0
     with pair.timings("evidence"):
-        # what will be followed is judged once, when it has been
-        seen = see_whole(pair, found) if pair.may_bend else None
-        follows = seen is not None and seen.must_follow(pair, bent)
-        if not follows:
-            accuracy, evidence = gather(guess, refined, fitted, heard)
-        if follows or bent or passes(judge(evidence, options)):
-            whole, everyone, closer = seen or see_whole(pair, found)
-            clouds = whole.clouds
-            if everyone is not None and not follows:
-                again = gather(guess, refined, everyone, heard)
-                if passes(judge(again[1], options)):
-                    fitted, (accuracy, evidence), whole = everyone, again, closer
-            follows = follows or (may_follow(pair, whole) and whole.is_bent(options))
-            if follows:
-                refined, fitted = follow(pair, Found(guess, refined, fitted), whole)
-                accuracy, evidence = gather(guess, refined, fitted, heard)
-                whole = whole.followed(pair, fitted)
-            else:
-                whole = whole.at_best(pair)
-            accuracy, evidence = whole.added_to(accuracy, evidence)
-            notes = whole.warnings(options)
-        notes += bands_warning(evidence)
-    model, reasons = fitted.selection.estimate.model, judge(evidence, options)
+        carried = carry(pair, found, heard, bent)
+        notes = (*carried.warnings(options), *bands_warning(carried.evidence))
+    refined, fitted = carried.refined, carried.fitted
+    model, reasons = fitted.selection.estimate.model, judge(carried.evidence, options)
     bands: tuple[BandMap, ...] = ()
     if options.per_band and passes(reasons):
         from geodelreg.fine.per_band import match_each_band
@@ -275,97 +196,22 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
         notes += unheard_bands(pair, bands)
     moves = any(moves_pair(pair, one) for one in (fitted.map, *(band.map for band in bands)))
     if options.model in FOLLOWING and model != options.model and passes(reasons):
-        in_the_way = clouds > LEAST_SHARE
-        why = clouds_in_the_way(clouds) if in_the_way else too_few_for_a_field(accuracy.kept)
-        reasons = (*reasons, why)
+        reasons = (*reasons, carried.why_no_field())
     names = [pair.source.band_names[band - 1] for band in pair.source_bands]
     return Solution(
         model=model,
         map=fitted.map,
         tie_points=fitted.points,
-        accuracy=accuracy,
+        accuracy=carried.accuracy,
         verdict=verdict(reasons, moves),
         step_counts=fitted.counts,
         band_weights=dict(zip(names, map(float, refined.tuning.tone.weights), strict=True)),
         warnings=warnings_of(pair, model, fitted.points, without_bright=refined.without_bright)
         + notes,
-        search=guess.search,
+        search=found.guess.search,
         bands=bands,
         form=None if fitted.points.weight is None else form_of(fitted.selection.estimate),
     )
-
-
-class Seen(NamedTuple):
-    """What all patches say about a map.
-
-    Attributes
-    ----------
-    whole : Whole
-    everyone : Fitted or None
-        The fit to all of the ground, where it is bent; None where those that agree spoke for it.
-    closer : Whole
-        Under that.
-    """
-
-    whole: Whole
-    everyone: Fitted | None
-    closer: Whole
-
-    def must_follow(self, pair: Pair, bent: bool) -> bool:
-        """True when no affine will do, or none was asked for."""
-        options = pair.options
-        asked = bent or options.model in FOLLOWING or self.closer.is_bent(options)
-        return asked and may_follow(pair, self.whole)
-
-
-def see_whole(pair: Pair, found: Found) -> Seen:
-    """Ask all patches about a map, and where they say that it bends, fit one to them."""
-    whole = look_at_whole(found.guess, found.refined, found.fitted.map)
-    everyone = hear_everyone(pair, found, whole)
-    return Seen(whole, everyone, whole if everyone is None else whole.under(pair, everyone.map))
-
-
-def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
-    """The fit to all of the ground, where it is bent; None where those that agree spoke for it."""
-    asked = pair.options
-    if not whole.is_bent(asked) or asked.method != "delaunay" or asked.model in BEYOND_A_HEADER:
-        return None
-    status = whole.status(found.refined.last.status)
-    return fit_patches(pair, found.guess, found.refined, status)
-
-
-def may_follow(pair: Pair, whole: Whole) -> bool:
-    """True when a field may be written, and clouds leave it enough of the ground."""
-    return pair.may_bend and whole.clouds <= LEAST_SHARE
-
-
-def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
-    """The ground's smooth map, matched through itself until it stands still.
-
-    Too few patches leave what was found.
-    """
-    from geodelreg.fine.settle import settle
-
-    guess, refined, fitted = found
-    with pair.timings("field"):
-        settled = settle(refined, whole.field or fitted.map)
-        if settled is None:
-            return refined, fitted
-        refined, fit = settled.refined, settled.fit
-        field: FieldMap | TinMap = fit.field
-        if pair.options.model == "tin":
-            field = facets_of(field.source, field.target, field.noise_px2)
-        tied = tie_points(refined.part, settled.matched, field, settled.status, settled.weight)
-        selection = selection_of(field, fit.distance2[fit.inlier], Frame.of(pair))
-        apart_px = pair.pan_px_per_source_px * halves_apart(field)
-        # a field follows its points: those that it has not seen say what chance would do
-        unseen = tied.residual_px.copy()
-        unseen[tied.kept] = pair.pan_px_per_source_px * selection.check.residual_px
-        log_nfa = patches_log_nfa(
-            refined.part, replace(tied, residual_px=unseen), points_that_fix("field")
-        )
-    counts = guess.counts | _patch_counts(settled.matched, tied)
-    return refined, Fitted(selection, tied, counts, log_nfa, apart_px)
 
 
 def _load_scipy() -> None:

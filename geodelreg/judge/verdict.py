@@ -17,7 +17,7 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Outcome, Reason, Verdict
 
-MIN_POINTS = 8  # unexplained: ablate
+MIN_POINTS = 8  # an affine, and one more than twice the three that fix it
 _MAX_LOG_EACH = -2.0  # one alarm in a hundred
 _MAX_LOG_TOGETHER = -8.0  # one alarm in 10 000 by each of two that look at different things
 _OFF_WHAT_IS_DRAWN = "log10 of the chance of both, off what is drawn on both images"
@@ -35,11 +35,11 @@ _LIMITS = (
     ("support", "≥", 0.5, "share of the areas correlates best in place"),
     ("bands_apart", "≤", 0.5, "coarser px between the places of two MS bands, as of clouds"),
 )
-"""Name of the evidence, what it must be, and the words for it; unexplained: ablate."""
+"""Name of the evidence, what it must be, and the words for it; docs/gate.md says why so much."""
 _LAST_LIMITS = (
     ("keypoints_apart", "≤", 2.0, "coarser px from where keypoints, more certain, put the ground"),
 )
-"""After what the user asked; unexplained: ablate."""
+"""After what the user asked: further is another place, and no inaccuracy of keypoints."""
 _OF_BANDS = ("bands_apart", "bands")
 """Not asked where each band is corrected by itself."""
 _BANDS_APART = "PAN px at least between the places of two MS bands"

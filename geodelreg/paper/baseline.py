@@ -17,6 +17,7 @@ from geodelreg.coarse.guesses import overviews
 from geodelreg.coarse.keypoints import detect, no_keypoints
 from geodelreg.coarse.scopes import SECOND_BUDGET_PX, scopes
 from geodelreg.errors import NoDataError
+from geodelreg.fine.fitted import Found
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.passes import Refinement, refine
 from geodelreg.fit.chance import log_nfa
@@ -119,7 +120,7 @@ def paper_fit(pair: Pair, images: Overview) -> PaperFit | None:
     )
 
 
-def with_patches(pair: Pair, fit: PaperFit) -> tuple[PaperFit, Refinement, Fitted] | None:
+def with_patches(pair: Pair, fit: PaperFit) -> Found | None:
     """A finished fit and the patches around it, as the gate's evidence; None of too few patches."""
     with pair.timings("refine"):
         area = refine(roles(pair), fit)
@@ -128,7 +129,7 @@ def with_patches(pair: Pair, fit: PaperFit) -> tuple[PaperFit, Refinement, Fitte
     check = held_out(fit.estimate.model, fit.observations, fit.estimate)
     selection = Selection(fit.estimate, check)
     apart = _apart(pair, fit, area)
-    return fit, area, Fitted(selection, fit.points, fit.counts, fit.log_nfa, apart)
+    return Found(fit, area, Fitted(selection, fit.points, fit.counts, fit.log_nfa, apart))
 
 
 def least_squares(model: str, points: Observations, frame: Frame) -> Estimate:
