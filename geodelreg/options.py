@@ -70,9 +70,8 @@ class AlignOptions:
     )
     agreeing_bands: tuple[int, ...] = knob(
         (),
-        "MS bands that must show the ground at one place, from 1, as N,N,...; those that are "
-        "matched on when not given. A warning names bands that lie 0.5 PAN pixels apart beyond "
-        "doubt; 1 pixel refuses.",
+        "MS bands that must show the ground at one place, from 1, as N,N,...; all when not given. "
+        "A warning names bands that lie 0.5 PAN pixels apart beyond doubt; 1 pixel refuses.",
     )
     pan_band: int = knob(
         1,

@@ -28,7 +28,6 @@ _BAND_SHARE = 0.5
 """Of the patches that the best band matches: bands that match fewer have no say."""
 _SURE_SIGMAS = 3.0
 _TWO_SIDED_95 = 1.96  # standard errors
-_HEARD_SHARE = 0.01  # of what the bands add to the image matched: less places nothing
 _NEAR_PX = 0.25  # of MS: one step from where the bands lie is right of less, and too long of more
 _FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
@@ -71,11 +70,11 @@ def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
 def ground_apart(
     found: Sequence[BandPass], refined: Refinement, correction: PixelMap, told_px: float
 ) -> BandsApart:
-    """The same of the ground alone: bands that must agree, each matched on all other bands.
+    """The same of the ground alone: each band matched on all other bands.
 
     A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
-    place than its own; among bands, what it shows alone widens its standard error.  Bands that must
-    agree are those that are matched on, or that were named.
+    place than its own; among bands, what it shows alone widens its standard error.  All bands must
+    agree unless some were named: one without a weight may have lost it by lying elsewhere.
 
     Parameters
     ----------
@@ -93,7 +92,7 @@ def ground_apart(
     known = patches.glance()
     if known is None:
         return BandsApart()
-    pairs = list(combinations(_must_agree(pair, refined), 2))
+    pairs = list(combinations(_must_agree(pair), 2))
     starts = [np.zeros_like(known.offset_px)]
     furthest = next(_gaps(found, pair), None)
     if furthest is not None and furthest.sure_px > told_px:
@@ -115,13 +114,10 @@ def ground_apart(
     return best
 
 
-def _must_agree(pair: Pair, refined: Refinement) -> list[int]:
-    """The bands that were named, else those with a weight, by their place among those read."""
-    named, tone = pair.options.agreeing_bands, refined.tuning.tone
-    if named:
-        return [pair.source_bands.index(number) for number in named if number in pair.source_bands]
-    part = tone.weights * tone.spread
-    return [int(band) for band in np.flatnonzero(part > _HEARD_SHARE * part.sum())]
+def _must_agree(pair: Pair) -> list[int]:
+    """The bands that were named, else all, by their place among those read."""
+    named = pair.options.agreeing_bands or pair.source_bands
+    return [pair.source_bands.index(number) for number in named if number in pair.source_bands]
 
 
 def _by_pan(found: Sequence[BandPass], pair: Pair) -> FloatArray:
