@@ -92,7 +92,8 @@ def ground_apart(
     known = patches.glance()
     if known is None:
         return BandsApart()
-    pairs = list(combinations(_must_agree(pair), 2))
+    odd = np.hypot(*(known.offset_px - np.median(known.offset_px, axis=0)).T)
+    pairs = list(combinations(sorted(_must_agree(pair), key=lambda band: odd[band]), 2))
     starts = [np.zeros_like(known.offset_px)]
     furthest = next(_gaps(found, pair), None)
     if furthest is not None and furthest.sure_px > told_px:
