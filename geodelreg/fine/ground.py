@@ -32,17 +32,20 @@ class Ground:
     Attributes
     ----------
     member : (N,) bool
-        Patches of the ground.
+        Patches of the ground: the largest layer, bent as it may be.
     label : (N,) intp
-        Layers as `geodelreg.fine.motions.layers` numbers them; all 0 or -1 where clouds explain
-        what moves, -1 being the clouds.
+        Layers as `geodelreg.fine.motions.layers` numbers them.
     look : CloudLook
-        Of the patches that do not fit to the affine that most agree on.
+        Of the patches that move against the affine that most agree on, or, where clouds cover most,
+        against the correction to be judged.
+    moving : float
+        Their share.
     """
 
     member: BoolArray
     label: IntArray
     look: CloudLook
+    moving: float
 
 
 def find_ground(
@@ -50,13 +53,8 @@ def find_ground(
     target: FloatArray,
     variance_px2: FloatArray,
     brightest: FloatArray,
-    calm: bool = False,
 ) -> Ground:
-    """Tell the ground from what moves differently.
-
-    Where clouds explain what moves, the ground is what one affine explains: it kept still.  That is
-    the affine that most agree on, or, where clouds cover most, the correction to be judged.
-    Elsewhere it is the largest layer, bent as it may be.
+    """Tell layers apart, and whether what moves against one affine looks like clouds.
 
     Parameters
     ----------
@@ -67,18 +65,15 @@ def find_ground(
         Trace of the covariance of `target`.
     brightest : (N,) float64
         As for `geodelreg.fine.clouds.cloud_look`.
-    calm : bool
-        Nearly all patches are known to agree on a gentle field: none of them is a cloud's, whatever
-        part an affine explains and however bright the rest.
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
     core = consensus_affine(source, target, variance_px2, tolerance).inliers
+    look, moving = CloudLook(), 0.0
     for still in (core, np.hypot(*(target - source).T) <= tolerance):
-        look = cloud_look(source, ~still, brightest)
-        if look.explains and not calm:
-            return Ground(still, np.where(still, 0, -1).astype(np.intp), look)
+        if not look.explains:
+            look, moving = cloud_look(source, ~still, brightest), float((~still).mean())
     label = layers(source, target - source, np.sqrt(variance_px2))
-    return Ground(label == 0, label, look)
+    return Ground(label == 0, label, look, moving)
 
 
 def other_motions(

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.fit.estimate import Observations
+from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 MOST_STRAIN = 0.04
@@ -77,6 +79,13 @@ def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
     edge = ~core & (votes.max(axis=1) > 0)
     label[edge] = votes[edge].argmax(axis=1)
     return label
+
+
+def largest_layer(points: Observations, correction: PixelMap) -> BoolArray:
+    """(N,) True of the points that are one smooth ground, however far from where a map has them."""
+    move = points.target - correction.forward(points.source)
+    sigma = np.sqrt(points.covariance.trace(axis1=1, axis2=2))
+    return np.asarray(layers(points.source, move, sigma) == 0)
 
 
 def neighbours(xy: FloatArray) -> IntArray:

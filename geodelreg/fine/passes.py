@@ -21,6 +21,7 @@ from geodelreg.fine.layers import (
 from geodelreg.fine.least_squares import MatchOptions
 from geodelreg.fine.looks import HAZE, PLAIN, SHARPER, Look, preference, sharpest
 from geodelreg.fine.matching import match_pass
+from geodelreg.fine.motions import largest_layer
 from geodelreg.fine.tiles import (
     Tile,
     dark_tile,
@@ -58,8 +59,9 @@ _MUCH_VISIBLE = 0.75  # unexplained: ablate
 _MINORITY = 0.4
 """Share of the patches that agree, below which the others may have spoilt the tone: a robust fit
 breaks down at half, and patches at the edge of what shows something hold some of the rest."""
-_GENTLE = 4.0
-"""Patches within which a field varies: waves 7.5 patches long give 4.3, banks of clouds below 2."""
+_GENTLE = 2.0
+"""Patches within which a field varies: hills as wide as a patch give 2.1, banks of clouds that as
+many follow 1.5 at most."""
 _WITHIN_REACH = 0.6
 """Share of the textured patches: the affine of one part of waves leaves a third of them too far."""
 _BLURRED_SIGMA = 0.85  # of a pixel, the first of `geodelreg.fine.tuning` that is not usual
@@ -257,18 +259,19 @@ def _calm_bend(found: Refinement) -> Kernel | None:
     last = found.last
     matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
     least = _WITHIN_REACH * (last.status != Status.TEXTURE).sum()
-    if not found.part.pair.may_bend or len(matched) <= max(least, FEWEST_POINTS):
+    if len(matched) <= max(least, FEWEST_POINTS):
         return None
     points = last.points.take(matched)
-    if not np.ptp(points.source, axis=0).min() > 0:
+    ground = largest_layer(points, found.estimate.map)
+    if ground.mean() <= CALM_PATCHES or not np.ptp(points.source, axis=0).min() > 0:
         return None
     fit = fit_field(points)
-    if not _is_calm(fit, spacing(points)):
+    if not bends_gently(fit, spacing(points)):
         fit = cut_at_jumps(points, fit)
-    return fit.field.kernel if _is_calm(fit, spacing(points)) else None
+    return fit.field.kernel if bends_gently(fit, spacing(points)) else None
 
 
-def _is_calm(fit: FieldFit, spacing_px: float) -> bool:
+def bends_gently(fit: FieldFit, spacing_px: float) -> bool:
     """True when points agree to within their noise on a field that bends gently, or is cut."""
     kernel, calm = fit.field.kernel, CALM_SIGMA_PX**2
     agree = fit.inlier.mean() > CALM_PATCHES and kernel.nugget_px2 < calm

@@ -9,17 +9,17 @@ import numpy as np
 
 from geodelreg.fine.clouds import HeightParallax, height_parallax
 from geodelreg.fine.ground import Ground, find_ground, other_motions
-from geodelreg.fine.layers import ELSEWHERE
+from geodelreg.fine.layers import CALM_PATCHES, ELSEWHERE
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
-from geodelreg.fine.motions import layers
+from geodelreg.fine.motions import largest_layer
 from geodelreg.fine.overlay import overlay
-from geodelreg.fine.passes import Refinement
+from geodelreg.fine.passes import Refinement, bends_gently
 from geodelreg.fine.survey import REACH_PX, Places, survey
 from geodelreg.fine.tone import single_band
 from geodelreg.fit.choice import Fitted
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.field import FEWEST_POINTS, fit_field
+from geodelreg.fit.field import FEWEST_POINTS, fit_field, spacing
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.affine import AffineMap
@@ -194,13 +194,10 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     places = survey(overlay(part, template, surface, correction))
     index = np.flatnonzero(_placed(places))
     if len(index) < FEWEST_POINTS:
-        return _bent(refined, correction, agreed)
+        return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
     doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
-    calm = refined.bend is not None
-    ground = find_ground(at, at + move, doubt, places.brightest[index], calm)
-    if ground.look.explains and not calm:
-        return replace(agreed, clouds=float((~ground.member).mean()))
+    ground = find_ground(at, at + move, doubt, places.brightest[index])
     to_full = ~part.template.grid.transform @ template.grid.transform
     unit = float(np.sqrt(abs(to_full.determinant)))
     unseen = refined.dark_only | (np.hypot(*move.T) * unit > MAX_MOVE * part.step)
@@ -214,9 +211,12 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     seen = Matched(
         apply_affine(to_full, at[far]), position, covariance, none, none.astype(np.uint8)
     )
-    whole = _bent(refined, correction, agreed, observe(part, seen, correction))
+    whole, gentle = _bent(refined, correction, agreed, observe(part, seen, correction))
+    # what a smooth field explains is no cloud, however bright and high above the ground
+    if ground.look.explains and not gentle:
+        return replace(agreed, clouds=ground.moving)
     moved, words = _other_motion(refined, places, index, ground, unit)
-    if moved or whole.is_bent(part.pair.options):
+    if moved or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
             return replace(agreed, clouds=height.share)
@@ -284,8 +284,11 @@ def _other_motion(
 
 def _bent(
     refined: Refinement, correction: PixelMap, agreed: Whole, far: Observations | None = None
-) -> Whole:
-    """The ground's smooth map through patches of the last pass, and those out of its reach."""
+) -> tuple[Whole, bool]:
+    """The ground's smooth map through patches of the last pass, and those out of its reach.
+
+    And whether nearly all of them agree on it, and it bends gently.
+    """
     pair, last = refined.part.pair, refined.last
     matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
     points = last.points.take(matched)
@@ -295,16 +298,18 @@ def _bent(
             np.concatenate([points.target, far.target]),
             np.concatenate([points.covariance, far.covariance]),
         )
-    move = points.target - correction.forward(points.source)
-    sigma = np.sqrt(points.covariance.trace(axis1=1, axis2=2))
-    member = layers(points.source, move, sigma) == 0
+    member = largest_layer(points, correction)
     some = np.flatnonzero(member)[:: 1 + int(member.sum()) // _MOST_POINTS]
     if len(some) < FEWEST_POINTS or not np.ptp(points.source[some], axis=0).min() > 0:
-        return agreed
-    field = fit_field(points.take(some), refined.bend).field
+        return agreed, False
+    ground_points = points.take(some)
+    fit = fit_field(ground_points, refined.bend)
+    agree = float(member.mean()) * fit.inlier.mean() > CALM_PATCHES
+    gentle = agree and bends_gently(fit, spacing(ground_points))
     ground = np.zeros(len(last.status), dtype=np.bool_)
     ground[matched] = member[: len(matched)]
-    return Whole(_left(pair, field, correction), ground, field=field)
+    whole = Whole(_left(pair, fit.field, correction), ground, field=fit.field)
+    return whole, refined.bend is not None or gentle
 
 
 def _left(pair: Pair, field: FieldMap, correction: PixelMap) -> Residual:

@@ -26,6 +26,7 @@ from benchmarks.gate.distortions import (
 )
 from benchmarks.scenes.imagery import sample_imagery
 from benchmarks.scenes.make import Bend, HeaderError, SceneSpec, make_scene, write_scene
+from benchmarks.scenes.truth import apply
 from geodelreg import Alignment, AlignOptions
 from geodelreg.errors import AlignmentRefusedError
 from geodelreg.product.check import check_dict
@@ -117,6 +118,46 @@ def test_waves_are_written_when_told_by_the_best_affine_of_the_whole(
 def test_the_limit_of_the_residual_is_the_users(wavy: Made) -> None:
     alignment = geodelreg.align(wavy.ms, wavy.pan, AlignOptions(max_residual_px=5.0))
     assert alignment.verdict.accepted
+
+
+def hills(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(...,) height of four hills, 1 at the top, at (..., 2) PAN pixels."""
+    tops = np.array([(160, 150), (460, 210), (190, 470), (480, 500)])
+    return np.exp(-(((xy[..., None, :] - tops) / 60.0) ** 2).sum(axis=-1) / 2).sum(axis=-1)
+
+
+def displaced(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return hills(xy)[..., None] * (3.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def hilly(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Hills lie off what stays, and are so bright that they could be clouds."""
+    scene = make_scene(replace(SPEC, ms_shape=(145, 145), ratio=4.0), sample_imagery(), displaced)
+    to_pan = ~Affine(*scene.truth.pan) @ Affine(*scene.truth.ms_true)
+    seen = centres(scene.ms.shape[-2:], to_pan)
+    bright = [
+        np.rint(image * (1 + hills(xy))).astype(np.uint16)
+        for image, xy in (
+            (scene.ms, seen + displaced(seen)),
+            (scene.pan, centres(SHAPE, Affine.identity())),
+        )
+    ]
+    pair = BentPair(replace(scene, ms=bright[0], pan=bright[1]), displaced)
+    return written(tmp_path_factory.mktemp("hilly"), pair)
+
+
+def centres(shape: tuple[int, ...], to_pan: Affine) -> NDArray[np.float64]:
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return np.stack(apply(to_pan, columns, rows), axis=-1)
+
+
+def test_bright_hills_that_bend_are_no_clouds_whatever_may_be_written(hilly: Made) -> None:
+    assert failed(refusal(hilly)[1]) == {"local"}
+    told = geodelreg.align(hilly.ms, hilly.pan, AlignOptions(on_local="warn"))
+    assert not any("clouds" in warning for warning in told.warnings)
+    best = hilly.rms_px(hilly.pair.best_affine())
+    assert hilly.rms_px(told.correction.corrected) < 1.1 * best
 
 
 def test_a_second_motion_is_refused_and_its_place_is_told(torn: Made) -> None:

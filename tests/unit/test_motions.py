@@ -137,17 +137,18 @@ def test_the_ground_between_more_clouds_is_where_the_correction_puts_it() -> Non
     shift = np.where(moves[:, None], (-1.7, 1.1), (0.0, 0.0)) + rng.normal(0, 0.01, xy.shape)
     ground = find_ground(xy, xy + shift, np.full(len(xy), 1e-4), brightest(moves, 8.0, rng))
     assert ground.look.explains
-    assert (ground.member == ~moves).mean() > 0.95
+    assert ground.moving == pytest.approx(moves.mean(), abs=0.05)
 
 
-def test_snowy_hills_are_no_clouds_where_all_patches_agree_on_a_field() -> None:
+def test_snowy_hills_look_like_clouds_and_are_one_layer_of_ground() -> None:
     rng, xy = np.random.default_rng(9), lattice()
     gap = xy[:, None] - np.array([(100.0, 90.0), (290.0, 130.0), (120.0, 300.0), (300.0, 310.0)])
     height = np.exp(-((gap / 30.0) ** 2).sum(axis=2) / 2).sum(axis=1)
     there = xy + noisy(height[:, None] * (0.5, 0.3), rng, 0.01)
     doubt, shown = np.full(len(xy), 1e-4), brightest(height > 0.1, 8.0, rng)
-    assert find_ground(xy, there, doubt, shown).look.explains
-    assert find_ground(xy, there, doubt, shown, calm=True).member.all()
+    ground = find_ground(xy, there, doubt, shown)
+    assert ground.look.explains
+    assert ground.member.all()
 
 
 def test_a_scene_that_is_brighter_at_the_end_that_moves_shows_no_clouds() -> None:
