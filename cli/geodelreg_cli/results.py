@@ -211,7 +211,6 @@ def check_outputs(request: Request) -> list[Path]:
     """
     from geodelreg.geotiff.atomic import tidy
     from geodelreg.geotiff.targets import STDOUT, Inputs
-    from geodelreg.report.candidate import candidate_files
     from geodelreg.report.output import check_report
     from geodelreg_cli.outputs import check_gcp_formats, check_targets, raster_targets
 
@@ -239,6 +238,8 @@ def check_outputs(request: Request) -> list[Path]:
             rasters,
         )
         if request.candidate is not None:
+            from geodelreg.report.candidate import candidate_files
+
             kept, overwrite = candidate_files(request.candidate), request.write_options.overwrite
             check_targets([*inputs, *map(str, written)], kept, overwrite, request.candidate)
         for path in request.reports:
@@ -293,10 +294,10 @@ def run(request: Request, find: Callable[[Progress], Alignment]) -> None:
 
 
 def _keep_candidate(alignment: Alignment, request: Request) -> None:
-    from geodelreg.report.candidate import has_candidate, write_candidate
-
     if request.candidate is None:
         return
+    from geodelreg.report.candidate import has_candidate, write_candidate
+
     if not has_candidate(alignment):
         logging.getLogger(__name__).warning("warning: nothing was found that could be kept")
         return
