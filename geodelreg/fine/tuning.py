@@ -159,7 +159,6 @@ def fit_sigma(
     per_tile = max(_SAMPLES // len(chosen), LEAST_SAMPLES)
     lattices = [lattice(tile.template[0], part, per_tile) for tile in chosen]
     covered = [_covered(part, tile.template[0], agreed, size) for tile in chosen]
-    places = [there.forward(xy)[:, None] for xy, _ in lattices]
 
     def unexplained(sigma: float) -> float:
         total = 0.0
@@ -173,6 +172,7 @@ def fit_sigma(
         return total
 
     with ThreadPoolExecutor(part.pair.threads) as pool:
+        places = list(pool.map(lambda of: there.forward(of[0])[:, None], lattices))
         unlike = dict(zip(_USUAL, pool.map(unexplained, _USUAL), strict=True))
     usual = min(unlike.values())
     if usual >= len(chosen):  # nowhere enough to judge by

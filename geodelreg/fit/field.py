@@ -72,7 +72,7 @@ def fit_field(
     start : Kernel, optional
         Of a fit to nearly the same points; saves time.
     jumps : tuple of float
-        Rows at which the images are cut.
+        Rows at which the images are cut; points at just these are on neither side, and left out.
 
     Raises
     ------
@@ -84,16 +84,19 @@ def fit_field(
     extent = np.ptp(points.source, axis=0)
     if not extent.min() > 0:
         raise ValueError("points on a line cannot determine a field")
-    inlier, weight = np.ones(len(points), dtype=bool), np.ones(len(points))
-    distance2 = np.zeros(len(points))
+    inlier, weight = ~np.isin(points.source[:, 1], jumps), np.ones(len(points))
+    distance2 = np.where(inlier, 0.0, np.inf)
     kernel = start or _first_guess(points)
     for number in range(_ROUNDS):
         kept = points.take(inlier)
         if number == 0 or start is None:
             kernel = tuned(kept, kernel, weight[inlier], jumps).kernel
-        distance2[inlier] = _unlike(field_of(kept, kernel, weight[inlier], jumps), kept)
-        weight = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
+        field = field_of(kept, kernel, weight[inlier], jumps)
+        distance2[inlier] = _unlike(field, kept)
         enough = distance2 <= _REJECT_D2
+        if number and enough[inlier].all():  # another round would hardly change the weights
+            return FieldFit(field, weight[inlier], inlier, distance2)
+        weight = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
         if (inlier & enough).sum() < FEWEST_POINTS:
             break
         inlier = inlier & enough
@@ -189,11 +192,9 @@ def tuned(
         try:
             for i, variance in enumerate(trial.variance_px2):
                 axis = solve_axis(columns, correlation, move[:, i], noise[:, i], variance)
-                steep = axis.precision() - np.outer(axis.alpha, axis.alpha)
                 total += axis.cost()
-                slope[0] += variance * np.vdot(steep, growth)
-                slope[1 + i] = variance * np.vdot(steep, correlation)
-                slope[3] += trial.nugget_px2 * (np.diag(steep) / weight).sum()
+                spread, grow, noisy = axis.rates(growth, correlation, 1 / weight)
+                slope[[0, 1 + i, 3]] += variance * spread, variance * grow, trial.nugget_px2 * noisy
         except np.linalg.LinAlgError:
             return _IMPOSSIBLE, np.zeros(4)
         return total, slope

@@ -68,14 +68,28 @@ class Axis:
         logs = np.log(np.diag(self.factor)).sum() + np.log(np.diag(self.normal)).sum()
         return float(2.0 * logs + self.white @ self.white)
 
-    def precision(self) -> FloatArray:
-        """(N, N) of the points, with what the trend takes of it; `alpha` is it times the moves."""
+    def rates(self, *changes: FloatArray) -> list[float]:
+        """Of `cost`, while the covariance of the points changes (Rasmussen & Williams 2006, 5.9).
+
+        Parameters
+        ----------
+        *changes : (N, N) or (N,) float64
+            Symmetric, or diagonals.
+        """
         from scipy.linalg.lapack import dpotri
 
-        half, _ = dpotri(self.factor, lower=1)
-        inverse = np.tril(half) + np.tril(half, -1).T
+        half, _ = dpotri(self.factor, lower=1)  # symmetric, as changes are: half of it tells all
+        own = np.diag(half)
         trend = _lower(self.normal, _upper(self.factor, self.design).T)
-        return np.asarray(inverse - trend.T @ trend)
+        taken = np.vstack([trend, self.alpha])
+        found = []
+        for change in changes:
+            if change.ndim == 1:
+                found.append(own @ change - (taken**2).sum(axis=0) @ change)
+                continue
+            whole = 2 * np.vdot(half.T, change) - own @ np.diag(change)
+            found.append(whole - np.vdot(taken, taken @ change))
+        return found
 
     def predict(self, near: FloatArray, columns: FloatArray) -> FloatArray:
         """(M,) displacement."""
@@ -120,29 +134,37 @@ def solve_axis(
     numpy.linalg.LinAlgError
         The points determine no trend.
     """
-    from scipy.linalg import cho_solve, cholesky
-
     total = variance_px2 * correlation
     total[np.diag_indices_from(total)] += noise_px2 + _JITTER * variance_px2
-    factor = cholesky(total, lower=True, check_finite=False, overwrite_a=True)
+    factor = _factor(total)
     design = _lower(factor, columns)
     white = _lower(factor, move)
-    normal = cholesky(design.T @ design, lower=True)
-    beta = cho_solve((normal, True), design.T @ white)
+    normal = _factor(design.T @ design)
+    beta = _upper(normal, _lower(normal, design.T @ white))
     white = white - design @ beta
     return Axis(variance_px2, factor, design, normal, beta, white, _upper(factor, white))
 
 
-def _lower(factor: FloatArray, right: FloatArray) -> FloatArray:
-    from scipy.linalg import solve_triangular
+# LAPACK itself: SciPy's own checks cost more than small equations
 
-    return np.asarray(solve_triangular(factor, right, lower=True, check_finite=False))
+
+def _factor(matrix: FloatArray) -> FloatArray:
+    from scipy.linalg.lapack import dpotrf
+
+    factor, failed = dpotrf(matrix.T, lower=1, clean=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("the points determine no trend")
+    return np.asarray(factor)
+
+
+def _lower(factor: FloatArray, right: FloatArray, transposed: bool = False) -> FloatArray:
+    from scipy.linalg.lapack import dtrtrs
+
+    return np.asarray(dtrtrs(factor, right, lower=1, trans=int(transposed))[0])
 
 
 def _upper(factor: FloatArray, right: FloatArray) -> FloatArray:
-    from scipy.linalg import solve_triangular
-
-    return np.asarray(solve_triangular(factor, right, lower=True, trans=1, check_finite=False))
+    return _lower(factor, right, transposed=True)
 
 
 def distances(one: FloatArray, other: FloatArray) -> FloatArray:
