@@ -89,7 +89,8 @@ class Settled:
 def settle(refined: Refinement, start: PixelMap) -> Settled | None:
     """Match and fit in turn until the next pass would move the field by less than it is uncertain.
 
-    Smaller patches are tried where the field bends within few of them.
+    A look that was chosen because patches disagreed, as they do where the ground bends, is held
+    against the plain one.  Smaller patches are tried where the field bends within few of them.
 
     Parameters
     ----------
@@ -103,7 +104,10 @@ def settle(refined: Refinement, start: PixelMap) -> Settled | None:
         None when too few patches matched.
     """
     refined = _everywhere(refined, start)
-    best = _passes(refined, start, refined.size)
+    plain = replace(refined, tuning=replace(refined.tuning, high_pass=0.0, local_tone=False))
+    looks = [refined, plain] if refined.tuning.high_pass or refined.tuning.local_tone else [plain]
+    found = [one for one in (_passes(look, start, look.size) for look in looks) if one is not None]
+    best = min(found, key=_unknown, default=None)
     if best is not None and refined.size > SMALLEST_PATCH_PX and _bends(best):
         finer = _passes(best.refined, best.fit.field, SMALLEST_PATCH_PX)
         if finer is not None and _unknown(finer) < _unknown(best):
@@ -112,7 +116,7 @@ def settle(refined: Refinement, start: PixelMap) -> Settled | None:
 
 
 def _everywhere(refined: Refinement, start: PixelMap) -> Refinement:
-    """With tiles that leave out neither bright objects, which are the ground's, nor much between.
+    """With tiles that leave out neither bright objects, which are the ground's, nor the borders.
 
     Parameters
     ----------
@@ -123,11 +127,10 @@ def _everywhere(refined: Refinement, start: PixelMap) -> Refinement:
     region = overlap_in_template(part, start)
     if region is None:
         return refined
-    windows = plan_tiles(region, part, dense=True)
-    if len(windows) == len(plan_tiles(region, part)) and not refined.dark_only:
-        return refined  # adjoining ones
-    tiles = read_tiles(part, windows, start)
-    size = patch_size(region.width * region.height / part.step**2)
+    tiles = read_tiles(part, plan_tiles(region, part, dense=True), start)
+    size = refined.size
+    if refined.dark_only:  # they may be smaller because much was hidden
+        size = patch_size(region.width * region.height / part.step**2)
     return replace(refined, tiles=tiles, size=size, dark_only=False) if tiles else refined
 
 

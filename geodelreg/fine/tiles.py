@@ -101,14 +101,27 @@ def plan_tiles(region: Window, part: Roles, dense: bool = False) -> list[Window]
 
 
 def _spans(offset: int, length: int, size: int, patches: int, dense: bool) -> list[tuple[int, int]]:
-    """(start, length) of the tiles along one axis; adjoining ones hold whole patches."""
+    """(start, length) of the tiles along one axis; adjoining ones hold whole patches.
+
+    What is left over lies outside, or where it is asked for what is between patches, too, between
+    the tiles: a field is least sure of what lies outside.
+    """
     tile, most = size * patches, _DENSE_TILES_PER_AXIS if dense else _MOST_TILES_PER_AXIS
     if length > most * size * (1 if dense else _SPREAD_TILE_PATCHES):
         gaps = np.linspace(0, length - tile, most)
         return [(offset + round(float(gap)), tile) for gap in gaps]
-    tile, usable = size * _ADJOINING_TILE_PATCHES, length // size * size
-    first = offset + (length - usable) // 2
-    return [(first + start, min(tile, usable - start)) for start in range(0, usable, tile)]
+    count = length // size
+    tiles = -(-count // _ADJOINING_TILE_PATCHES)
+    firsts = _ADJOINING_TILE_PATCHES * np.arange(tiles + 1)
+    over = length - count * size
+    before = np.full(tiles, over // 2)
+    if dense and tiles > 1:
+        before = np.rint(np.linspace(0, over, tiles)).astype(int)
+    ends = np.minimum(firsts, count) * size
+    return [
+        (offset + int(gap + start), int(end - start))
+        for gap, start, end in zip(before, ends, ends[1:], strict=False)
+    ]
 
 
 def read_tile(part: Roles, window: Window, correction: PixelMap) -> Tile | None:

@@ -7,6 +7,7 @@ much likelier that chance, asked at every row, does not make it.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,8 +22,9 @@ _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
 _CANDIDATES = 3
 _SIDE_ROWS = 3
-_LEAST_PER_PART = 6
-"""Points, for the offset of a part and its noise."""
+_LEAST_PER_PART = 3
+"""Points, for the offset of a part: of a third of the patches a row that is cut through has some
+more."""
 
 
 def cut_at_jumps(points: Observations, smooth: FieldFit) -> FieldFit:
@@ -40,6 +42,8 @@ def cut_at_jumps(points: Observations, smooth: FieldFit) -> FieldFit:
 
 def find_jumps(points: Observations, kernel: Kernel, weight: FloatArray) -> tuple[float, ...]:
     """Rows where the displacement jumps, ascending; none where a smooth field explains as much.
+
+    Between two rows of patches, or at one whose patches are cut through.
 
     Parameters
     ----------
@@ -71,6 +75,19 @@ def find_jumps(points: Observations, kernel: Kernel, weight: FloatArray) -> tupl
         if best is None or here.cost() - best[0] < price:
             break
         here, jumps = best[1], best[1].jumps
+    return _through_rows(rows, jumps)
+
+
+def _through_rows(rows: FloatArray, jumps: tuple[float, ...]) -> tuple[float, ...]:
+    """One jump through a row of patches in place of two that have it alone between them.
+
+    A jump cuts through these patches, and they say where neither side of it lies.
+    """
+    held = [rows[(rows > above) & (rows < below)] for above, below in pairwise(jumps)]
+    for number, between in enumerate(held):
+        if len(between) == 1:
+            through = (*jumps[:number], float(between[0]), *jumps[number + 2 :])
+            return _through_rows(rows, through)
     return jumps
 
 

@@ -31,7 +31,8 @@ from geodelreg_cli.main import cli
 Array = NDArray[np.float64]
 SHAPE = (640, 640)
 RATIO = 2.0
-SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=RATIO)
+MS_PX, PATCH_PX = 295, 20  # no multiple
+SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (MS_PX, MS_PX), ratio=RATIO)
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,13 @@ def test_waves_are_followed_and_the_standard_error_is_right(
     assert 0.5 < np.sqrt(((error**2).sum(axis=1) / sigma**2).mean()) < 1.6
     assert followed.accuracy.check_rmse_px < 0.1
     assert followed.accuracy.residual_rms_px < 0.1
+
+
+def test_its_points_reach_the_borders(followed: Alignment) -> None:
+    points = followed.tie_points
+    at = points.source_px[points.kept]
+    assert (at.min(axis=0) <= PATCH_PX / 2).all()
+    assert (at.max(axis=0) >= MS_PX - PATCH_PX / 2).all()
 
 
 def test_facets_follow_worse_and_say_so(wavy: Made, followed: Alignment) -> None:

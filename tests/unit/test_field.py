@@ -162,6 +162,23 @@ def test_a_jump_is_found_to_a_row_of_patches_and_cut(amplitude: float) -> None:
     assert np.abs(cut.inverse(cut.forward(at)) - at).max() < 1e-7
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_patches_that_a_jump_cuts_through_are_on_neither_side_of_it(share: float) -> None:
+    xy = lattice()
+    astride = xy[:, 1] == 230.0
+    move = np.where(astride[:, None], share * step(np.array([[0.0, SIDE]])), step(xy))
+    points = observe(move, xy, np.random.default_rng(12))
+    smooth = fit_field(points)
+    jumps = find_jumps(points.take(smooth.inlier), smooth.field.kernel, smooth.weight)
+    assert jumps == (230.0,)
+    cut = fit_field(points, jumps=jumps)
+    assert not cut.inlier[astride].any()
+    at = places(np.random.default_rng(13))
+    at = at[np.abs(at[:, 1] - 230.0) > SPACING / 2]
+    gap = cut.field.forward(at) - at - step(at)
+    assert np.sqrt((gap**2).sum(axis=1).mean()) < NOISE_PX / 2
+
+
 def test_a_field_out_of_its_numbers_is_the_same_map() -> None:
     fit, at = fitted(200.0, seed=6), places(np.random.default_rng(7))
     again = FieldMap.from_json(json.loads(json.dumps(fit.to_json())))
