@@ -34,7 +34,6 @@ class AlignKnobs(TypedDict, total=False):
     on_local: str
     threads: int
     allow: str
-    seed: int
 
 
 class WriteKnobs(TypedDict, total=False):

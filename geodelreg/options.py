@@ -156,7 +156,6 @@ class AlignOptions:
         "of any file.",
         ACCESS,
     )
-    seed: int = knob(0, "Seed of the random sampling; the same seed gives the same bytes.")
 
     def __post_init__(self) -> None:
         check_choice(self, "method")

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from benchmarks.report import machine, replace_section
-from geodelreg.fit.consensus import consensus_affine
+from geodelreg.fit.consensus import consensus
 from geodelreg.fit.delaunay_mesh import filter_matches, star_filter
 from geodelreg.paper.zhang2013 import initial_status, reject_unshared
 from geodelreg.values.points import Status
@@ -76,7 +76,7 @@ def draw_matches(case: Case, seed: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 def by_delaunay(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> BoolArray:
     """Loose global consensus, then the Delaunay mesh: geodelreg's default."""
-    found = consensus_affine(source, reference, ratio, LOOSE_PX)
+    found = consensus(source, reference, LOOSE_PX)
     return np.asarray(filter_matches(source, reference, found) == Status.KEPT)
 
 

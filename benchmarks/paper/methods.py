@@ -23,7 +23,7 @@ from geodelreg.fine.passes import COARSE_SIGMA
 from geodelreg.fine.surface import make_surface
 from geodelreg.fine.tiles import overview_tile
 from geodelreg.fine.tuning import surface_sigma
-from geodelreg.fit.consensus import consensus_affine
+from geodelreg.fit.consensus import consensus
 from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.fit.estimate import Observations, minimum_points
 from geodelreg.fit.models import Frame
@@ -229,7 +229,7 @@ def run_mesh(matched: Matched) -> tuple[BoolArray, dict[str, int]]:
     status, counts = run_steps(matched, ["3 one-to-one"])
     kept = np.flatnonzero(status == Status.KEPT)
     points = matched.source_xy[kept], matched.reference_xy[kept]
-    mesh = filter_matches(*points, consensus_affine(*points, matched.ratio[kept], LOOSE_PX))
+    mesh = filter_matches(*points, consensus(*points, LOOSE_PX))
     chosen = np.zeros(len(status), dtype=np.bool_)
     chosen[kept[mesh == Status.KEPT]] = True
     return chosen, counts | {"our filter": int(chosen.sum())}

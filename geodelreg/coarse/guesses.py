@@ -20,7 +20,7 @@ from geodelreg.errors import NoDataError
 from geodelreg.fine.layers import SURE_LOG_NFA, bright_mask, in_doubt, is_calm_guess
 from geodelreg.fine.looks import band_looks
 from geodelreg.fit.chance import log_nfa
-from geodelreg.fit.consensus import Consensus, consensus_keypoints, fit_plainly, radial_residuals
+from geodelreg.fit.consensus import Consensus, consensus, fit_plainly, radial_residuals
 from geodelreg.fit.delaunay_mesh import filter_matches
 from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import AffineMap
@@ -255,13 +255,12 @@ def _agree(
     """The log NFA of the correction that most matches agree on, and that unless it is chance."""
     if len(matches) < _FEWEST_MATCHES:
         return math.inf, None
-    seed = pair.options.seed
-    similar = consensus_keypoints(*keypoints, matches, _THRESHOLD_PX, seed=seed, kind="similarity")
     source_xy, reference_xy = matches.xy(*keypoints)
-    if similar.map is None:
+    found = consensus(source_xy, reference_xy, _THRESHOLD_PX, "similarity")
+    if found.map is None:
         return math.inf, None
-    loose = radial_residuals(similar.map, source_xy, reference_xy) <= _LOOSE_PX
-    mesh = filter_matches(source_xy, reference_xy, Consensus(similar.map, loose))
+    loose = radial_residuals(found.map, source_xy, reference_xy) <= _LOOSE_PX
+    mesh = filter_matches(source_xy, reference_xy, Consensus(found.map, loose))
     inliers = mesh == Status.KEPT
     counts = counts | {"consensus": int(loose.sum()), "Delaunay mesh": int(inliers.sum())}
     if inliers.sum() < _FEWEST_MATCHES:

@@ -15,7 +15,7 @@ from geodelreg.fine.motions import (
     layers,
     second_motion,
 )
-from geodelreg.fit.consensus import consensus_affine
+from geodelreg.fit.consensus import consensus
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 _CORE_SIGMAS = 3.0
@@ -67,7 +67,7 @@ def find_ground(
         As for `geodelreg.fine.clouds.cloud_look`.
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
-    core = consensus_affine(source, target, variance_px2, tolerance).inliers
+    core = consensus(source, target, tolerance).inliers
     look, moving = CloudLook(), 0.0
     for still in (core, np.hypot(*(target - source).T) <= tolerance):
         if not look.explains:

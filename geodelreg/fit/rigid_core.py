@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from geodelreg.fit.consensus import consensus_affine
+from geodelreg.fit.consensus import consensus
 from geodelreg.fit.estimate import Observations
 from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
@@ -15,7 +15,6 @@ _CORE_FLOOR_PX = 0.03  # of a patch pixel; unexplained: ablate
 _GROWTH = 1.5  # of the tolerance from try to try; unexplained: ablate
 _SHIFT_SHARE = 0.15  # unexplained: ablate
 _AFFINE_SHARE = 0.25  # unexplained: ablate
-_SOUGHT_SHARE = _AFFINE_SHARE / 2  # so long that of several such shares the best is found
 _CORE_REACH = 2.0
 
 
@@ -58,7 +57,5 @@ def _affine_residuals(
     points: Observations, variance: FloatArray, tolerance: float
 ) -> list[FloatArray]:
     """(N, 2) residuals of the best affine; none where there is none."""
-    found = consensus_affine(
-        points.source, points.target, variance, tolerance, least_share=_SOUGHT_SHARE
-    )
+    found = consensus(points.source, points.target, tolerance)
     return [] if found.map is None else [points.target - found.map.forward(points.source)]

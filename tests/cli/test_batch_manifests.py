@@ -149,7 +149,7 @@ def test_a_million_columns_are_refused_in_one_line(folder: Path, geodelreg: Comm
         '{"ms": "ms.tif", "pan": ["pan.tif"], "out": "a.tif"}',
         '{"ms": "ms.tif", "ms": "pan.tif", "pan": "pan.tif", "out": "a.tif"}',
         '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "band": 1e999}',
-        '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "seed": ' + "9" * 5000 + "}",
+        '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "threads": ' + "9" * 5000 + "}",
         '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "ratio": NaN}',
         '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "warp": "yes", "georef": "gcps"}',
         '{"ms": "ms.tif", "pan": "pan.tif", "out": "a.tif", "creation_options": "X"}',

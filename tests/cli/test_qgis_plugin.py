@@ -164,7 +164,7 @@ def test_options_that_differ_from_the_defaults_reach_the_command(
         "model": "shift",
         "band": 2,
         "search_radius_px": 300.5,
-        "seed": 7,
+        "max_keypoints": 2500,
         "max_shift_px": 80.0,
         "on_local": "warn",
         "ratio": 0.8,

@@ -277,8 +277,8 @@ def test_wrong_keywords_are_named(argument: str, value: Any, kind: type[Exceptio
 
 
 def test_keywords_replace_what_the_options_say(tmp_path: Path) -> None:
-    alignment = geodelreg.align(MS, PAN, AlignOptions(model="affine", seed=5), model="shift")
-    assert (alignment.options.model, alignment.options.seed) == ("shift", 5)
+    alignment = geodelreg.align(MS, PAN, AlignOptions(model="affine", ratio=0.7), model="shift")
+    assert (alignment.options.model, alignment.options.ratio) == ("shift", 0.7)
     (tmp_path / "out.tif").write_bytes(b"mine")
     geodelreg.write(alignment, tmp_path / "out.tif", overwrite=True)
     with rasterio.open(tmp_path / "out.tif") as dataset:

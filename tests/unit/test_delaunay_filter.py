@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodelreg.fit.consensus import Consensus, consensus_affine
+from geodelreg.fit.consensus import Consensus, consensus
 from geodelreg.fit.delaunay_mesh import filter_matches, star_filter, unfolded
 from geodelreg.geo.triangulation import delaunay, twice_area
 from geodelreg.values.points import Status
@@ -36,7 +36,7 @@ def filtered(
 ) -> StatusArray:
     """What the mesh leaves of a loose consensus."""
     if found is None:
-        found = consensus_affine(source, reference, ratio, 8.0)
+        found = consensus(source, reference, 8.0)
     return filter_matches(source, reference, found)
 
 
@@ -62,7 +62,7 @@ def test_precision_and_recall(count: int, outlier_share: float, distortion_px: f
 def test_global_consensus_alone_would_lose_distorted_inliers() -> None:
     """What the mesh is for: at the tolerance that noise alone asks for, an affine loses many."""
     source, reference, ratio, right = contaminated(500, 0.3, seed=4)
-    alone = consensus_affine(source, reference, ratio, 1.5).inliers
+    alone = consensus(source, reference, 1.5).inliers
     assert precision_recall(alone, right)[1] < 0.8
     mesh = filtered(source, reference, ratio) == Status.KEPT
     assert precision_recall(mesh, right)[1] > 0.99
@@ -70,7 +70,7 @@ def test_global_consensus_alone_would_lose_distorted_inliers() -> None:
 
 def test_recovers_inliers_that_the_consensus_lost() -> None:
     source, reference, ratio, right = contaminated(500, 0.5, seed=5, distortion_px=4.0)
-    found = consensus_affine(source, reference, ratio, 2.5)
+    found = consensus(source, reference, 2.5)
     lost = right & ~found.inliers
     assert lost.sum() > 30
     kept = filtered(source, reference, ratio, found) == Status.KEPT
@@ -128,7 +128,7 @@ def test_status_tells_consensus_from_star() -> None:
 
 def test_given_consensus_is_used() -> None:
     source, reference, ratio, right = contaminated(300, 0.4, seed=10, distortion_px=0.0)
-    found = consensus_affine(source, reference, ratio, 8.0)
+    found = consensus(source, reference, 8.0)
     given = filtered(source, reference, ratio, found)
     assert given.tolist() == filtered(source, reference, ratio).tolist()
     nothing = Consensus(None, np.zeros(300, dtype=np.bool_))
