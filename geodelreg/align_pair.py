@@ -8,17 +8,21 @@ from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
 
+import numpy as np
+
 from geodelreg.coarse.guesses import guesses
 from geodelreg.coarse.header import ProvenGuess
 from geodelreg.coarse.scopes import scopes
 from geodelreg.errors import NoOverlapError
 from geodelreg.fine.fitted import Found, fit_patches
+from geodelreg.fine.ground import ANOTHER_PX
 from geodelreg.fine.layers import Claim, on_the_mesh
 from geodelreg.fine.passes import refine, refine_proven
 from geodelreg.fit.field import form_of
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.bending import carry
 from geodelreg.judge.verdict import (
+    OF_THE_WHOLE,
     judge,
     moves_pair,
     nothing_agrees,
@@ -51,6 +55,21 @@ class _Refused(NamedTuple):
     @property
     def passed(self) -> int:
         return sum(reason.passed for reason in self.solution.verdict.reasons)
+
+    def denies(self, other: Solution) -> bool:
+        """True of a map of the same place, where all patches found the ground torn or bent.
+
+        That they were asked once more, of images read otherwise, does not make it whole.
+        """
+        reasons = self.solution.verdict.reasons
+        if other.model in FOLLOWING or any(
+            not reason.passed and reason.name not in OF_THE_WHOLE for reason in reasons
+        ):
+            return False
+        corners = self.pair.source_lattice(2)
+        here, there = (self.pair.move_px(one.map, corners) for one in (self.solution, other))
+        nearest_px = ANOTHER_PX * self.pair.pan_px_per_coarser_px
+        return bool(np.hypot(*(here - there).T).max() <= nearest_px)
 
 
 def align_pair(
@@ -92,6 +111,7 @@ def align_pair(
     report = progress or (lambda fraction, step: None)
     pair = make_pair(source, reference, options, timings)
     refused: list[_Refused] = []
+    proven: list[_Refused] = []
     heard: list[Claim] = []
     looked = 0.0
     report(_OPENED, "reading")
@@ -111,11 +131,13 @@ def align_pair(
             for reason in solution.verdict.reasons:
                 if not reason.passed:
                     logger.info("not believed: %s", reason.message)
+            tried = _Refused(solution, seen, found, tuple(heard))
             if solution.verdict.accepted:
-                report(1.0, "done")
-                return seen, solution
-            if not isinstance(guess, ProvenGuess):  # keypoints will have the last word
-                refused.append(_Refused(solution, seen, found, tuple(heard)))
+                if not any(one.denies(solution) for one in (*refused, *proven)):
+                    report(1.0, "done")
+                    return seen, solution
+            else:  # after what was proven keypoints have the last word
+                (proven if isinstance(guess, ProvenGuess) else refused).append(tried)
         heard.append(Claim(guess.map, guess.log_nfa))
         looked = (1.0 + looked) / 2
     refused.sort(key=lambda one: one.passed, reverse=True)
@@ -126,6 +148,7 @@ def align_pair(
                 report(1.0, "done")
                 return one.pair, solution
     report(1.0, "refused")
+    refused = refused or proven
     return pair, refused[0].solution if refused else _nothing_found(pair)
 
 

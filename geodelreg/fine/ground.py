@@ -21,7 +21,7 @@ from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 _CORE_SIGMAS = 3.0
 _CORE_FLOOR_PX = 0.05
 """Of a rigid ground: what interpolation and unlike point spreads leave, coarser pixels."""
-_ANOTHER_PX = 1.5
+ANOTHER_PX = 1.5
 """From which a motion is another one: dense matching reaches so far, and follows what is nearer."""
 
 
@@ -113,13 +113,13 @@ def other_motions(
     for number in range(1, int(label.max(initial=0)) + 1):
         member = label == number
         centre = np.median(move[member], axis=0)
-        if member.sum() < least or not np.hypot(*centre) > _ANOTHER_PX:
+        if member.sum() < least or not np.hypot(*centre) > ANOTHER_PX:
             continue
         both = member | (label == 0)
         if not cloud_look(source[both], member[both], brightest[both]).explains:
             found.append(Motion(member, centre))
-    strays = (label < 0) & (np.hypot(*move.T) > _ANOTHER_PX)
-    strip = second_motion(move, strays, _ANOTHER_PX, reach_px)
+    strays = (label < 0) & (np.hypot(*move.T) > ANOTHER_PX)
+    strip = second_motion(move, strays, ANOTHER_PX, reach_px)
     if strip is not None and strip.member.sum() >= least and is_solid(source, strip.member):
         found.append(strip)
     return sorted(found, key=lambda motion: -int(motion.member.sum()))

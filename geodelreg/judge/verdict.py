@@ -42,6 +42,8 @@ _LAST_LIMITS = (
 """After what the user asked: further is another place, and no inaccuracy of keypoints."""
 _OF_BANDS = ("bands_apart", "bands")
 """Not asked where each band is corrected by itself."""
+OF_THE_WHOLE = ("two_motions", "local")
+"""Asked of all patches about a map that those which agree speak for."""
 _BANDS_APART = "PAN px at least between the places of two MS bands"
 _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
