@@ -150,7 +150,9 @@ def _explained(
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
     energy = (image**2).sum(axis=(2, 3))
     share = seen.mean(axis=2)
-    good = share > least_valid(share[:, 0])
+    least = least_valid(share[:, 0])
+    good = share > least * share[:, :1]  # elsewhere other pixels are hidden than those of the patch
+    good[:, 0] = share[:, 0] > least
     good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
     return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
 

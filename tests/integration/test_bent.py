@@ -230,14 +230,16 @@ def test_a_shaded_image_is_refused_though_clipped_clouds_hold_most_of_its_contra
     assert "shading" in failed(refusal(written(tmp_path, pair))[1])
 
 
-def drawn_on(folder: Path, kind: str, same_ground: bool, spec: SceneSpec = SPEC) -> Made:
+def drawn_on(
+    folder: Path, kind: str, same_ground: bool, spec: SceneSpec = SPEC, seed: int = 2
+) -> Made:
     """A pair, or a scene and its mirror image, with the same structure on the grid of both."""
     imagery, spec = sample_imagery(), replace(spec, error=HeaderError((6.0, -4.0)))
     scene = make_scene(spec, imagery)
     if not same_ground:
         mirrored = replace(imagery, bands=np.ascontiguousarray(imagery.bands[:, :, ::-1]))
         scene = replace(scene, pan=make_scene(spec, mirrored).pan)
-    frame((scene.ms, scene.pan), kind, np.random.default_rng(2))
+    frame((scene.ms, scene.pan), kind, np.random.default_rng(seed))
     return written(folder, BentPair(scene, same_ground=same_ground))
 
 
@@ -254,10 +256,22 @@ def test_a_pattern_of_the_pixel_grid_is_left_out_when_told(tmp_path: Path) -> No
     assert pair.rms_px(told.correction.corrected) < 0.1
 
 
-@pytest.mark.parametrize("kind", ["fixed pattern", "stripes"])
-def test_what_is_drawn_on_both_is_found_left_out_and_told(kind: str, tmp_path: Path) -> None:
-    # stripes leave no patch of so small a raster whole
-    pair = drawn_on(tmp_path, kind, True, replace(SPEC, pan_shape=(320, 320), ms_shape=(150, 150)))
+LITTLE = replace(SPEC, pan_shape=(320, 320), ms_shape=(150, 150))
+COARSE = replace(SPEC, pan_shape=(600, 600), ms_shape=(135, 135), ratio=4.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spec", "seed"),
+    [
+        ("fixed pattern", LITTLE, 2),
+        ("stripes", LITTLE, 2),  # leave no patch whole
+        ("stripes", COARSE, 12),  # of each patch a third, and less beside its place
+    ],
+)
+def test_what_is_drawn_on_both_is_found_left_out_and_told(
+    kind: str, spec: SceneSpec, seed: int, tmp_path: Path
+) -> None:
+    pair = drawn_on(tmp_path, kind, True, spec, seed)
     found = geodelreg.align(pair.ms, pair.pan)
     assert pair.rms_px(found.correction.corrected) < 0.1
     for name in ("ms.tif", "pan.tif"):
