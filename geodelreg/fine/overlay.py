@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from affine import Affine
@@ -56,24 +55,42 @@ class Overlay:
 
 def overlay(part: Roles, template: Band, surface: Surface, correction: PixelMap) -> Overlay:
     """Resample a surface onto a (decimated) template window under a correction."""
-    there = part.to_surface(correction)
     height, width = template.data.shape
-    to_full = ~part.template.grid.transform @ template.grid.transform
+    place = placed(part, template, correction)
     values = np.empty((height, width), dtype=np.float32)
     usable = np.empty((height, width), dtype=np.bool_)
     for top in range(0, height, _ROWS):  # positions need ten times the memory of values
         some = slice(top, min(top + _ROWS, height))
-        place: Values = partial(_places, there, to_full @ Affine.translation(0, top))
-        if correction.as_affine() is None:
-            place, _ = interpolated(place, (some.stop - top, width), _SPLINE_PX)
-        sides = (pixel_centres(np.arange(side)) for side in (some.stop - top, width))
+        sides = (pixel_centres(np.arange(*side)) for side in ((some.start, some.stop), (0, width)))
         values[some], usable[some] = sample(surface, place(*sides))
     return Overlay(template.data, values, template.valid, usable)
 
 
-def _places(there: PixelMap, to_full: Affine, y: FloatArray, x: FloatArray) -> FloatArray:
-    """(R, C, 2) where a map puts the pixels at rows and columns of a decimated grid."""
-    return there.forward(apply_affine(to_full, np.stack(np.meshgrid(x, y), axis=-1)))
+def placed(part: Roles, template: Band, correction: PixelMap) -> Values:
+    """Where pixels of a (decimated) template window lie in the surface raster, outer corner.
+
+    Of a map that is no affine through a spline: a field costs a kernel for each of its points.
+    Where the images jump, through one on either side.
+    """
+    there = part.to_surface(correction)
+    to_full = ~part.template.grid.transform @ template.grid.transform
+
+    def asked(y: FloatArray, x: FloatArray) -> FloatArray:
+        return there.forward(apply_affine(to_full, np.stack(np.meshgrid(x, y), axis=-1)))
+
+    if correction.as_affine() is not None:
+        return asked
+    pieces = correction.pieces()
+    if len(pieces) == 1 or not part.ms_is_template:
+        return interpolated(asked, template.data.shape, _SPLINE_PX)[0]
+    sides = [placed(part, template, piece) for piece, _, _ in pieces]
+    jumps = [(low - to_full.f) / to_full.e for _, low, _ in pieces[1:]]
+
+    def on_its_side(y: FloatArray, x: FloatArray) -> FloatArray:
+        rows = np.split(y, np.searchsorted(y, jumps, side="right"))
+        return np.concatenate([side(some, x) for side, some in zip(sides, rows, strict=True)])
+
+    return on_its_side
 
 
 def widened(part: Roles, template: Band, surface: Band, correction: PixelMap) -> Band:

@@ -21,7 +21,7 @@ from geodelreg.fine.passes import Refinement
 from geodelreg.fine.surface import make_surface, sample
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tone import single_band
-from geodelreg.fine.tuning import lattice, tile_images
+from geodelreg.fine.tuning import lattice, places, tile_images
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, FloatArray
@@ -275,6 +275,6 @@ def _look(refined: Refinement, common: PixelMap, blur: float, tile: Tile) -> _Se
         local_tone=False,
     )
     surface = tile_images(part, Tile(tile.template, tile.surface), tuning)[1]
-    pan, usable = sample(surface, part.to_surface(common).forward(xy)[:, None])
+    pan, usable = sample(surface, places(part, band, take, common)[:, None])
     good = usable[:, 0] & np.logical_and.reduce([one.valid[take] for one in tile.template])
     return _Seen(tile, xy, good, np.asarray(pan[:, 0], dtype=np.float64))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geodelreg.fine.overlay import placed
 from geodelreg.fine.surface import Surface, high_pass, make_surface, sample
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tone import SyntheticPan, fit_synthetic_pan, single_band
@@ -81,12 +82,12 @@ def fit_tone(
     Judged everywhere, or where patches agreed, whose (N, 2) centres and side are given: areas that
     show something in one image alone have no tone.
     """
-    there, per_tile = part.to_surface(correction), max(samples // len(tiles), LEAST_SAMPLES)
+    per_tile = max(samples // len(tiles), LEAST_SAMPLES)
 
     def samples_of(tile: Tile) -> tuple[Float32Array, Float32Array]:
-        xy, take = lattice(tile.template[0], part, per_tile)
+        _, take = lattice(tile.template[0], part, per_tile)
         surfaces = _surfaces(part, tile, sigma)
-        place = there.forward(xy)[:, None]
+        place = places(part, tile.template[0], take, correction)[:, None]
         fine = [sample(surface, place) for surface in surfaces]
         good = np.logical_and.reduce([usable[:, 0] for _, usable in fine])
         good &= np.logical_and.reduce([band.valid[take] for band in tile.template])
@@ -123,6 +124,14 @@ def lattice(
     return np.stack([x, y], axis=1), (rows, columns)
 
 
+def places(
+    part: Roles, band: Band, take: tuple[np.ndarray, np.ndarray], correction: PixelMap
+) -> FloatArray:
+    """(N, 2) where pixels of a `lattice` lie in the surface raster."""
+    sides = (pixel_centres(np.unique(side)) for side in take)
+    return placed(part, band, correction)(*sides).reshape(-1, 2)
+
+
 def tile_images(part: Roles, tile: Tile, tuning: Tuning) -> tuple[list[Band], Surface]:
     """The template band (or the bands, with local tone) and the surface of a tile."""
     low_pass, wide = surface_sigma(part, tile, tuning.sigma), 0.0
@@ -153,26 +162,25 @@ def fit_sigma(
     Judged where patches of `size` pixels agreed in the pass before, whose (N, 2) centres are given:
     clouds have a sharpness, too.
     """
-    there = part.to_surface(correction)
     count = max(_PIXELS // max(tiles[0].surface[0].data.size, 1), 1)
     chosen = tiles[len(tiles) // (2 * count) :: max(len(tiles) // count, 1)][:count]
     per_tile = max(_SAMPLES // len(chosen), LEAST_SAMPLES)
-    lattices = [lattice(tile.template[0], part, per_tile) for tile in chosen]
+    lattices = [lattice(tile.template[0], part, per_tile)[1] for tile in chosen]
+    pixels = zip(chosen, lattices, strict=True)
+    where = [places(part, tile.template[0], take, correction) for tile, take in pixels]
     covered = [_covered(part, tile.template[0], agreed, size) for tile in chosen]
 
     def unexplained(sigma: float) -> float:
         total = 0.0
-        where = zip(chosen, lattices, covered, places, strict=True)
-        for tile, (_, take), inside, place in where:
+        for tile, take, inside, place in zip(chosen, lattices, covered, where, strict=True):
             images = Tile(tile.template, tile.surface)
             (template,), surface = tile_images(part, images, replace(tuning, sigma=sigma))
-            values, usable = sample(surface, place)
+            values, usable = sample(surface, place[:, None])
             good = usable[:, 0] & template.valid[take] & inside[take]
             total += _unexplained(values[good, 0], template.data[take][good])
         return total
 
     with ThreadPoolExecutor(part.pair.threads) as pool:
-        places = list(pool.map(lambda of: there.forward(of[0])[:, None], lattices))
         unlike = dict(zip(_USUAL, pool.map(unexplained, _USUAL), strict=True))
     usual = min(unlike.values())
     if usual >= len(chosen):  # nowhere enough to judge by

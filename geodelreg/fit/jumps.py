@@ -7,6 +7,7 @@ much likelier that chance, asked at every row, does not make it.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -67,6 +68,8 @@ def find_jumps(points: Observations, kernel: Kernel, weight: FloatArray) -> tupl
             cut = tuple(sorted({*jumps, float(middle[number])}))
             if len(cut) == len(jumps) or not _each_has_points(here.source, cut):
                 continue
+            if replace(here, jumps=cut).cost() > here.cost():
+                continue  # no kernel will make a cut pay that this one's range has no use for
             field = tuned(points, here.kernel, weight, cut)
             found.append((field.cost(), field))
         # restricted likelihoods of unlike trends: the step's own unknown weighs log N per axis

@@ -139,10 +139,10 @@ class FieldMap(SmoothMap):
         ends = [-np.inf, *self.jumps, np.inf]
         if self.only is not None or not self.jumps:
             return super().pieces()
-        return [
-            (replace(self, only=part), ends[part], ends[part + 1])
-            for part in range(len(self.jumps) + 1)
-        ]
+        parts = [replace(self, only=part) for part in range(len(self.jumps) + 1)]
+        for part in parts:
+            vars(part)["axes"] = self.axes  # the same equations: they are solved once
+        return list(zip(parts, ends, ends[1:], strict=False))
 
     def to_json(self) -> dict[str, Any]:
         """All that it is made of; every point as source, target and variances."""
