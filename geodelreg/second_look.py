@@ -60,15 +60,17 @@ def _other_ways(
     """What to take for PAN instead, and why."""
     pair, solution = first
     options = pair.options
+    drawn: tuple[str, ...] = ()
     if options.ms_nodata is None and options.pan_nodata is None:
         notes = ms.leave_out_drawn(), pan.leave_out_drawn()
+        drawn = tuple(filter(None, notes))  # edges of labels are no slopes of the ground, either
         if all(notes):
-            yield pan, notes
+            yield pan, drawn
     failed = {reason.name for reason in solution.verdict.reasons if not reason.passed}
     if failed & _UNLIKE and options.method == "delaunay":
         slopes = as_slopes(pair)
         if slopes is not None:
-            yield slopes, (_words(slopes),)
+            yield slopes, (*drawn, _words(slopes))
 
 
 def _words(slopes: Slopes) -> str:

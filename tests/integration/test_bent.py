@@ -281,6 +281,20 @@ def test_what_is_drawn_on_both_is_found_left_out_and_told(
     assert len(points) >= 8
 
 
+def test_labels_on_a_shaded_image_are_left_out_of_its_slopes_and_told(tmp_path: Path) -> None:
+    scene = make_scene(LITTLE, sample_imagery())
+    scene = replace(scene, ms=relief_shading(scene.ms, np.random.default_rng(3)))
+    frame((scene.ms, scene.pan), "labels", np.random.default_rng(2))
+    pair = written(tmp_path, BentPair(scene))
+    found = geodelreg.align(pair.ms, pair.pan)
+    assert pair.rms_px(found.correction.corrected) < 0.1
+    assert any("shaded like relief" in warning for warning in found.warnings)
+    for name in ("ms.tif", "pan.tif"):
+        of_one = [warning for warning in found.warnings if f"drawn on {name}" in warning]
+        assert len(of_one) == 1
+        assert "4000 is left out" in of_one[0]
+
+
 def test_ground_that_is_right_beside_labels_is_no_less_so(tmp_path: Path) -> None:
     pair = drawn_on(tmp_path, "labels", same_ground=True)
     assert pair.rms_px(geodelreg.align(pair.ms, pair.pan).correction.corrected) < 0.1
