@@ -7,6 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from geodelreg.geo.affine import affine_matrix
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, FloatArray
@@ -15,6 +16,7 @@ _MAX_STRETCH = 8.0  # or its inverse: no header of an MS and a PAN is as wrong
 _FEWEST = {"similarity": 2, "affine": 3}
 _MISSED = 1e-4  # probability that no sample was all inliers
 _MOST_SAMPLES = 20_000  # of two matches, of which 3 % are right: eighteen are both right
+_LOOSENING = (4.0, 2.0, 1.0, 1.0)  # of the threshold, from fit to fit (Chum et al. 2003)
 
 
 class Consensus(NamedTuple):
@@ -64,6 +66,14 @@ def consensus(
     if matrix is None or not _is_plausible(matrix):
         return nothing
     best = AffineMap.of(matrix)
+    for loosening in _LOOSENING:  # two or three exact matches alone aim badly at the others
+        near = radial_residuals(best, source_xy, reference_xy) <= loosening * threshold_px
+        if near.sum() <= _FEWEST[kind]:
+            break
+        closer = fit_plainly(source_xy[near], reference_xy[near], kind)
+        if not _is_plausible(affine_matrix(closer.as_affine())):
+            break
+        best = closer
     return Consensus(best, radial_residuals(best, source_xy, reference_xy) <= threshold_px)
 
 
