@@ -27,9 +27,6 @@ FOLDS = 5  # a fifth of the points is held out at a time
 _BLOCKS = 8  # 64 of them: the folds are twelve or thirteen each
 _INSIDE = 1 - 1e-9  # the last point is in the last block
 _SIGNIFICANT_T = 2.5  # a chance of 1 % or so with as many blocks
-_NORTH_UP_LOSS = 0.04  # unexplained: ablate
-_LOSS = 0.01  # unexplained: ablate
-_NEGLIGIBLE_PX = 0.005  # of PAN; unexplained: ablate
 _TILT_PX = 0.1
 """Of PAN, at a corner: less is not worth a raster that GDAL's pansharpening refuses."""
 _LEAST_PREDICTED = 0.5
@@ -149,7 +146,6 @@ def select_model(
     frame: Frame,
     corners: FloatArray,
     model: str,
-    negligible_px: float,
     tilt_px: float = 0.0,
 ) -> Selection:
     """Fit one model, or choose the simplest whose held-out error is not significantly worse.
@@ -162,8 +158,6 @@ def select_model(
         Corners of the source raster, pixels.
     model : str
         A model's name, or ``auto``.
-    negligible_px : float
-        Models that nowhere differ by more than this many source pixels count as equal.
     tilt_px : float
         A model that rotates or shears must move a corner by so many source pixels against the best
         one that does not; infinite for none.
@@ -186,13 +180,7 @@ def select_model(
     for name in candidates[:-1]:
         estimate = robust_fit(name, points, frame, extra_variance_px2=full.extra_variance_px2)
         check = held_out(name, points, estimate)
-        difference = estimate.map.forward(corners) - full.map.forward(corners)
-        apart = float(np.abs(difference).max())
-        if (
-            _paired_t(check.distance2 - check_full.distance2, blocks) < _SIGNIFICANT_T
-            or apart < negligible_px
-            or _as_good(check, check_full, _NORTH_UP_LOSS if name in NORTH_UP else _LOSS)
-        ):
+        if _paired_t(check.distance2 - check_full.distance2, blocks) < _SIGNIFICANT_T:
             estimate = robust_fit(name, points, frame)
             return Selection(estimate, held_out(name, points, estimate), neglected)
     return Selection(full, check_full, neglected)
@@ -217,19 +205,7 @@ def select_for(pair: Pair, points: Observations) -> Selection:
     asked, frame, ratio = pair.options, Frame.of(pair), pair.pan_px_per_source_px
     model = "affine" if asked.model in FOLLOWING else asked.model
     tilt = math.inf if asked.north_up else _TILT_PX / ratio
-    return select_model(points, frame, pair.source_lattice(2), model, _NEGLIGIBLE_PX / ratio, tilt)
-
-
-def _as_good(simple: HeldOut, full: HeldOut, loss: float) -> bool:
-    """True when the simpler model predicts held-out points as well, but for a small loss.
-
-    With many points a difference can be significant and of no use; a north-up raster is worth more
-    than a hundredth of the scatter of its tie points.
-    """
-    both = np.isfinite(simple.distance2) & np.isfinite(full.distance2)
-    if both.mean() < _LEAST_PREDICTED:
-        return False
-    return bool(simple.distance2[both].mean() <= (1 + loss) * full.distance2[both].mean())
+    return select_model(points, frame, pair.source_lattice(2), model, tilt)
 
 
 def _paired_t(difference: FloatArray, blocks: IntArray) -> float:

@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 SIDE = 500.0
 FRAME = Frame((SIDE / 2, SIDE / 2), SIDE / 2)
 CORNERS = np.array([[0.0, 0.0], [SIDE, 0.0], [0.0, SIDE], [SIDE, SIDE]])
-NEGLIGIBLE_PX = 0.00125
 TRUTHS = {
     "shift": [0.01, -0.02],
     "scale": [0.01, -0.02, 0.0008, -0.0007],
@@ -211,7 +210,7 @@ def test_the_simplest_true_model_is_chosen(truth: str, extra: float) -> None:
     chosen = []
     for seed in range(8):
         points = observe(truth, np.random.default_rng(seed), extra=extra)
-        selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX)
+        selection = select_model(points, FRAME, CORNERS, "auto")
         chosen.append(selection.estimate.model)
         assert np.abs(error(selection.estimate, truth)).max() < 0.06
     assert chosen.count(truth) >= 7
@@ -220,7 +219,7 @@ def test_the_simplest_true_model_is_chosen(truth: str, extra: float) -> None:
 @pytest.mark.parametrize(("tilt_px", "chosen"), [(0.0, "affine"), (50.0, "scale")])
 def test_rotation_must_pay_and_what_is_neglected_is_told(tilt_px: float, chosen: str) -> None:
     points = observe("affine", np.random.default_rng(10))
-    selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX, tilt_px)
+    selection = select_model(points, FRAME, CORNERS, "auto", tilt_px)
     assert selection.estimate.model in (chosen, "shift" if chosen == "scale" else chosen)
     left = np.hypot(*error(robust_fit("scale", points, FRAME), "affine").T).max()
     expected = 0.0 if chosen == "affine" else left
@@ -229,23 +228,23 @@ def test_rotation_must_pay_and_what_is_neglected_is_told(tilt_px: float, chosen:
 
 def test_what_only_noise_would_rotate_is_not_called_neglected() -> None:
     points = observe("shift", np.random.default_rng(10))
-    selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX, 50.0)
+    selection = select_model(points, FRAME, CORNERS, "auto", 50.0)
     assert selection.estimate.model == "shift"
     assert selection.neglected_px < 0.02
 
 
 def test_a_model_that_is_asked_for_is_taken() -> None:
     points = observe("affine", np.random.default_rng(10))
-    selection = select_model(points, FRAME, CORNERS, "shift", NEGLIGIBLE_PX)
+    selection = select_model(points, FRAME, CORNERS, "shift")
     assert selection.estimate.model == "shift"
 
 
 def test_few_points_get_a_model_they_can_carry() -> None:
     points = observe("shift", np.random.default_rng(11), 3)
-    selection = select_model(points, FRAME, CORNERS, "auto", NEGLIGIBLE_PX)
+    selection = select_model(points, FRAME, CORNERS, "auto")
     assert selection.estimate.model in ("shift", "scale", "similarity")
     with pytest.raises(ValueError, match="cannot determine"):
-        select_model(points, FRAME, CORNERS, "affine", NEGLIGIBLE_PX)
+        select_model(points, FRAME, CORNERS, "affine")
 
 
 def test_halves_disagree_by_about_the_error() -> None:
