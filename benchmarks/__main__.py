@@ -21,6 +21,7 @@ COMMANDS = {
         "the standard error where PAN and MS see different light",
     ),
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
+    "ablate": ("benchmarks.gate.ablate", "the method's rules switched off, one at a time"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),
     "peers-real": ("benchmarks.peers.real", "the same on real pairs, measured independently"),

@@ -76,7 +76,8 @@ def apply(transform: Affine, x: FloatArray, y: FloatArray) -> tuple[FloatArray, 
     return a * x + b * y + c, d * x + e * y + f
 
 
-def _to_pan_px(transform: Affine, xy: FloatArray, truth: Truth) -> FloatArray:
+def to_pan_px(transform: Affine, xy: FloatArray, truth: Truth) -> FloatArray:
+    """(N, 2) PAN pixels of (N, 2) MS pixels under a geotransform of MS."""
     from pyproj import CRS, Transformer
 
     x, y = apply(transform, xy[:, 0], xy[:, 1])
@@ -89,7 +90,7 @@ def _to_pan_px(transform: Affine, xy: FloatArray, truth: Truth) -> FloatArray:
 def pan_errors(corrected: Affine, truth: Truth) -> FloatArray:
     """(441, 2) float64: found minus true PAN position of the check points, in PAN pixels."""
     xy = check_points(truth.ms_shape)
-    return _to_pan_px(corrected, xy, truth) - _to_pan_px(Affine(*truth.ms_true), xy, truth)
+    return to_pan_px(corrected, xy, truth) - to_pan_px(Affine(*truth.ms_true), xy, truth)
 
 
 def grid_rmse(corrected: Affine, truth: Truth) -> dict[str, float]:
