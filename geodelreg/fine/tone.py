@@ -17,7 +17,6 @@ _WORTHWHILE = 0.97
 _RANGE_PERCENT = (0.2, 99.8)  # unexplained: ablate
 _TUKEY_ROUNDS = 6  # unexplained: ablate
 _RIDGE = 1e-6  # a sample, of standardised products: nothing beside their noise
-_MOST_FALLING = 0.2  # unexplained: ablate
 _ROUNDS = 12  # half of least absolute deviations, half of the biweight; unexplained: ablate
 _TUKEY = 3.0
 _LEVERAGE = 3.0
@@ -151,23 +150,9 @@ def _curved(
         curvature[used] = fitted[1 : 1 + used.sum()]
         steeper[free] = weights[free] + fitted[1 + used.sum() :]
         if (steeper >= 0).all():
-            if _rises(curvature, steeper, linear) and _is_worthwhile(design, without, left):
-                return curvature, steeper
-            return None
+            return (curvature, steeper) if _is_worthwhile(design, without, left) else None
         free &= steeper > 0
     return None
-
-
-def _rises(curvature: FloatArray, weights: FloatArray, linear: FloatArray) -> bool:
-    """True when brighter bands make the combination brighter, nearly everywhere.
-
-    Curvature that inverts the contrast of a band over part of its range describes changed fields
-    and lighting, not two sensors' tones, and spoils the small contrasts that are matched.
-    """
-    bend = np.zeros((len(weights), len(weights)))
-    bend[np.triu_indices(len(weights))] = curvature
-    slopes = weights + linear @ (bend + bend.T)
-    return bool(np.clip(-slopes, 0, None).sum() <= _MOST_FALLING * np.abs(slopes).sum())
 
 
 def _rising(
