@@ -189,6 +189,15 @@ def test_a_raster_of_a_few_patches_is_not_torn_in_silence(tmp_path: Path) -> Non
     assert "two_motions" in failed(refusal(torn)[1])
 
 
+def test_no_second_guess_of_a_place_makes_torn_ground_whole(tmp_path: Path) -> None:
+    """Read otherwise, the images show a patch less of the torn part, and too few for a motion."""
+    small = replace(
+        SPEC, pan_shape=(332, 332), ms_shape=(74, 74), ratio=4.0, pan_centre=(375.0, 336.0)
+    )
+    torn = made(tmp_path, Tear((-9.5, 5.6), 0.1826, 0.0, small.pan_shape), small)
+    assert "two_motions" in failed(refusal(torn)[1])
+
+
 def test_ground_between_clouds_is_aligned_and_their_share_told(tmp_path: Path) -> None:
     cloudy = written(tmp_path, BentPair(make_scene(CLOUDY, sample_imagery())))
     alignment = geodelreg.align(cloudy.ms, cloudy.pan)
