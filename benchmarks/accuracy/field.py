@@ -255,8 +255,9 @@ def run(args: argparse.Namespace) -> int:
             f"`python -m benchmarks field` (`--max-residual {MOST_LEFT_PX:g}`): PAN {PAN_PX}², MS "
             f"{MS_PX}² at 4:1 (smaller where the imagery is), waves of so many PAN px and so "
             f"long, and a jump of {JUMP_PX[0]:g} px along a row (RMSE away from "
-            f'it), on {machine()}.  "Normalised" is the error over its standard error, RMS.  '
-            f"Time and memory are the whole command's, without writing pixels.  Median scene: "
+            f'it), on {machine()}.  "Normalised" is the error over its standard error, '
+            "with the systematic part, RMS.  Time and memory are the whole command's, without "
+            "writing pixels.  Median scene: "
             f"{np.median([row['rmse_px'] for row in followed]):.3f} px; normalised error of all "
             f"scenes: {_pooled(followed):.2f}."
         )

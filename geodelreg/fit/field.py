@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geodelreg.fit.choice import FOLDS, HeldOut, Selection, fold_numbers, spatial_blocks
-from geodelreg.fit.estimate import Estimate, Observations
+from geodelreg.fit.estimate import REJECT_D2, Estimate, Observations, student_weight
 from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel, distances, solve_axis
@@ -23,8 +23,6 @@ FEWEST_POINTS = 12
 """Twice the parameters of the trend of both axes: fewer leave nothing to tell noise by."""
 MOST_STRAIN = 0.04
 """Of a field that is believed: relief seen at 20° bends by less, a fold by much more."""
-_STUDENT_DOF = 6.0  # unexplained: ablate
-_REJECT_D2 = 25.0  # unexplained: ablate
 _ROUNDS = 3
 _TUNING_POINTS = 160  # unexplained: ablate
 _LEAST_VARIANCE_PX2 = 1e-8  # unexplained: ablate
@@ -93,10 +91,10 @@ def fit_field(
             kernel = tuned(kept, kernel, weight[inlier], jumps).kernel
         field = field_of(kept, kernel, weight[inlier], jumps)
         distance2[inlier] = _unlike(field, kept)
-        enough = distance2 <= _REJECT_D2
+        enough = distance2 <= REJECT_D2
         if number and enough[inlier].all():  # another round would hardly change the weights
             return FieldFit(field, weight[inlier], inlier, distance2)
-        weight = (_STUDENT_DOF + 2) / (_STUDENT_DOF + distance2)
+        weight = student_weight(distance2)
         if (inlier & enough).sum() < FEWEST_POINTS:
             break
         inlier = inlier & enough
@@ -120,7 +118,7 @@ def fit_again(
     before, weight = np.isfinite(weight), np.where(np.isfinite(weight), weight, 1.0)
     field = field_of(points, kernel, weight, jumps)
     distance2 = _unlike(field, points)
-    inlier = before | (distance2 <= _REJECT_D2)
+    inlier = before | (distance2 <= REJECT_D2)
     if not inlier.all():
         field = field_of(points.take(inlier), kernel, weight[inlier], jumps)
     return FieldFit(field, weight[inlier], inlier, distance2)
