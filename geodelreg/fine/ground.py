@@ -120,6 +120,10 @@ def other_motions(
             found.append(Motion(member, centre))
     strays = (label < 0) & (np.hypot(*move.T) > ANOTHER_PX)
     strip = second_motion(move, strays, ANOTHER_PX, reach_px)
-    if strip is not None and strip.member.sum() >= least and is_solid(source, strip.member):
+    if (
+        strip is not None
+        and strip.member.sum() >= least
+        and is_solid(source, strip.member, label == 0)
+    ):
         found.append(strip)
     return sorted(found, key=lambda motion: -int(motion.member.sum()))

@@ -177,10 +177,18 @@ def second_motion(
     return Motion(member, centre)
 
 
-def is_solid(xy: FloatArray, member: BoolArray) -> bool:
-    """True when hardly any other of (N, 2) patches lies among the members: they are one part."""
+def is_solid(xy: FloatArray, member: BoolArray, ground: BoolArray) -> bool:
+    """True when hardly any of the ground's patches lies among the members: they are one part.
+
+    Parameters
+    ----------
+    xy : (N, 2) float64
+        All patches that were placed.
+    member, ground : (N,) bool
+        What is neither is placed by chance, and says nothing.
+    """
     from shapely import MultiPoint, contains_xy
 
     around = MultiPoint(xy[member]).convex_hull.buffer(_ROUNDING_PX)
     inside = contains_xy(around, xy[:, 0], xy[:, 1])
-    return bool(member[inside].mean() >= _SOLID)
+    return bool(member[inside].sum() >= _SOLID * (member | ground)[inside].sum())

@@ -64,7 +64,9 @@ class Places:
         return np.asarray(better * np.sqrt(independent / 2))
 
 
-def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
+def survey(
+    overlay: Overlay, reach: int = REACH_PX, aside: tuple[float, float] = (0.0, 0.0)
+) -> Places:
     """Correlate every patch with all places up to `reach` pixels away.
 
     Parameters
@@ -72,6 +74,8 @@ def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
     overlay : Overlay
         The surface under the correction to be judged.
     reach : int
+    aside : (float, float)
+        Where the grid of patches begins, in patches right and down of where it fits in evenly.
     """
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
@@ -79,9 +83,10 @@ def survey(overlay: Overlay, reach: int = REACH_PX) -> Places:
     noise = noise_of(template, overlay.template_valid)
     height, width = template.shape
     padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
+    right, down = (int(part * size) for part in aside)
     rows = []
-    for top in range((height % size) // 2, height - size + 1, size):
-        for left in range((width % size) // 2, width - size + 1, size):
+    for top in range((height % size) // 2 + down, height - size + 1, size):
+        for left in range((width % size) // 2 + right, width - size + 1, size):
             mine = slice(top, top + size), slice(left, left + size)
             shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
             if min(shown) < _LEAST_VALID:

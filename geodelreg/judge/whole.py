@@ -41,6 +41,9 @@ _CALM_RESIDUAL = 0.3
 """Of the largest residual allowed: what neighbours may share where no field need be fitted."""
 _PLACED_SCORE = 0.5
 _SURE_Z = 3.0
+_FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
+_ASIDE = ((0.5, 0.0), (0.0, 0.5), (0.5, 0.5))
+"""Of a patch: where other grids begin."""
 _SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
 _MOST_POINTS = 1000  # unexplained: ablate
 _PLACES = 200  # unexplained: ablate
@@ -191,13 +194,13 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     """Where every patch lies: the ground's, another motion's, or a cloud's."""
     part = refined.part
     template, _, surface = decimated(guess, refined, dark=False)
-    places = survey(overlay(part, template, surface, correction))
+    images = overlay(part, template, surface, correction)
+    places = survey(images)
     index = np.flatnonzero(_placed(places))
     if len(index) < FEWEST_POINTS:
         return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
-    doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
-    ground = find_ground(at, at + move, doubt, places.brightest[index])
+    ground = _ground_of(places, index)
     to_full = ~part.template.grid.transform @ template.grid.transform
     unit = float(np.sqrt(abs(to_full.determinant)))
     unseen = refined.dark_only | (np.hypot(*move.T) * unit > MAX_MOVE * part.step)
@@ -216,11 +219,24 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     if ground.look.explains and not gentle:
         return replace(agreed, clouds=ground.moving)
     moved, words = _other_motion(refined, places, index, ground, unit)
+    for aside in _ASIDE if len(places.centre) < _FEW_PATCHES else ():
+        if not moved:  # few patches may lie astride the edge of a part, all that it has
+            places = survey(images, aside=aside)
+            index = np.flatnonzero(_placed(places))
+            ground = _ground_of(places, index)
+            if not ground.look.explains or gentle:
+                moved, words = _other_motion(refined, places, index, ground, unit)
     if moved or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
             return replace(agreed, clouds=height.share)
     return replace(whole, moved=moved, words=words)
+
+
+def _ground_of(places: Places, index: IntArray) -> Ground:
+    at = places.centre[index]
+    doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
+    return find_ground(at, at + places.move[index], doubt, places.brightest[index])
 
 
 def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:

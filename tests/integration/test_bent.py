@@ -183,9 +183,23 @@ def test_no_field_follows_clouds(tmp_path: Path) -> None:
     assert "`mask`" in error.remedy
 
 
-def test_a_raster_of_a_few_patches_is_not_torn_in_silence(tmp_path: Path) -> None:
-    small = replace(SPEC, pan_shape=(360, 360), ms_shape=(82, 82), ratio=4.0)
-    torn = made(tmp_path, Tear((3.0, 20.0), 0.4, 0.0, small.pan_shape), small)
+SMALL_TEARS = {
+    "nearly half": (360, 4.0, None, (3.0, 20.0), 0.4),
+    "a row of patches, one of them misplaced": (332, 4.0, (216.0, 476.0), (-2.3, -9.3), 0.199),
+    "not far": (400, 2.0, (440.0, 452.0), (3.75, 0.73), 0.168),
+    "part of it beyond PAN": (400, 4.0, (567.0, 268.0), (-10.9, 26.6), 0.26),
+}
+
+
+@pytest.mark.parametrize("name", SMALL_TEARS)
+def test_a_raster_of_a_few_patches_is_not_torn_in_silence(name: str, tmp_path: Path) -> None:
+    side, ratio, centre, shift, share = SMALL_TEARS[name]
+    ms = round(0.9 * side / ratio)
+    small = replace(
+        SPEC, error=HeaderError((1.3, -0.7)), pan_shape=(side, side), ms_shape=(ms, ms),
+        ratio=ratio, pan_centre=centre,
+    )  # fmt: skip
+    torn = made(tmp_path, Tear(shift, share, 0.0, small.pan_shape), small)
     assert "two_motions" in failed(refusal(torn)[1])
 
 
