@@ -6,6 +6,7 @@ of them.  Here each patch of an overlay is correlated with all places around it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -65,17 +66,17 @@ class Places:
 
 
 def survey(
-    overlay: Overlay, reach: int = REACH_PX, aside: tuple[float, float] = (0.0, 0.0)
+    overlay: Overlay, reach: int = REACH_PX, aside: tuple[bool, bool] = (False, False)
 ) -> Places:
-    """Correlate every patch with all places up to `reach` pixels away.
+    """Correlate every patch with all places up to `reach` pixels away, from border to border.
 
     Parameters
     ----------
     overlay : Overlay
         The surface under the correction to be judged.
     reach : int
-    aside : (float, float)
-        Where the grid of patches begins, in patches right and down of where it fits in evenly.
+    aside : (bool, bool)
+        Whether the grid of patches lies between where it is without, across and down.
     """
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
@@ -83,10 +84,13 @@ def survey(
     noise = noise_of(template, overlay.template_valid)
     height, width = template.shape
     padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
-    right, down = (int(part * size) for part in aside)
+    across, down = (
+        _starts(length, size, between)
+        for length, between in zip((width, height), aside, strict=True)
+    )
     rows = []
-    for top in range((height % size) // 2 + down, height - size + 1, size):
-        for left in range((width % size) // 2 + right, width - size + 1, size):
+    for top in down:
+        for left in across:
             mine = slice(top, top + size), slice(left, left + size)
             shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
             if min(shown) < _LEAST_VALID:
@@ -112,6 +116,13 @@ def survey(
     centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
     score, here, textured, brightest = rest
     return Places(centre, move, score, here, textured > 0, brightest, size)
+
+
+def _starts(length: int, size: int, between: bool) -> list[int]:
+    """Where patches begin along an axis: the first and the last at a border, unless between."""
+    count = math.ceil(length / size) if length >= size else 0
+    at = np.linspace(0, max(length - size, 0), count).round().astype(int)
+    return [int(n) for n in ((at[:-1] + at[1:]) // 2 if between else at)]
 
 
 def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:

@@ -42,8 +42,7 @@ _CALM_RESIDUAL = 0.3
 _PLACED_SCORE = 0.5
 _SURE_Z = 3.0
 _FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
-_ASIDE = ((0.5, 0.0), (0.0, 0.5), (0.5, 0.5))
-"""Of a patch: where other grids begin."""
+_ASIDE = ((True, False), (False, True), (True, True))
 _SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
 _MOST_POINTS = 1000  # unexplained: ablate
 _PLACES = 200  # unexplained: ablate
@@ -185,6 +184,7 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     near = shared_by_neighbours(some.source, gap)
     textured = int((last.status != Status.TEXTURE).sum())
     calm = near.high_px <= _CALM_RESIDUAL * pair.options.max_residual_px
+    calm &= textured >= _FEW_PATCHES  # fewer leave out a border as wide as a small part
     if calm and not refined.dark_only and kept.sum() >= _CALM_SHARE * textured:
         return Whole(near, np.asarray(kept))
     return _surveyed(guess, refined, correction, Whole(near, np.asarray(kept)))
