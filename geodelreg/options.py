@@ -186,7 +186,7 @@ class AlignOptions:
         check_range(self, "max_shift_px", 0, 1e9)
         check_range(self, "max_rotation_deg", 0, 180)
         check_range(self, "max_scale", 1, 1e3)
-        check_range(self, "max_uncertainty_px", 0, 1e6)
+        check_range(self, "max_uncertainty_px", 1e-6, 1e6)
         check_range(self, "max_residual_px", 0, 1e6)
         check_choice(self, "on_local")
         if self.north_up and self.model not in ("auto", "shift", "scale"):

@@ -139,8 +139,7 @@ def _exit_code(found: Check) -> int:
     if found.outcome is CheckOutcome.CANNOT_TELL:
         raise AlignmentRefusedError(
             f"cannot tell whether {found.source_name} is aligned: {found.reason}",
-            "Check that both show the same ground; try --band with the band that looks most like "
-            "PAN, a larger --search-radius, or a larger --tolerance.",
+            found.remedy.replace("`limit_px`", "--tolerance"),
             found.alignment,
         )
     return MISALIGNED if found.outcome is CheckOutcome.MISALIGNED else 0

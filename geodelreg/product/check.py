@@ -14,6 +14,10 @@ from geodelreg.values.result import Alignment, BandMap, CheckOutcome, Misalignme
 
 _UNKNOWN = float("nan")
 _NOTHING_KNOWN = Misalignment()
+_UNSURE = (
+    "The place was found, but not surely enough: allow a larger tolerance (`limit_px`), or show a "
+    "larger part of the scene."
+)
 _WORDS = {
     CheckOutcome.ALIGNED: "aligned",
     CheckOutcome.MISALIGNED: "misaligned",
@@ -96,6 +100,12 @@ class Check:
         """Why nothing can be told, or that the raster is misaligned locally; else empty."""
         return explanation(self.raster_outcome, self.misalignment, self.alignment, self.limit_px)
 
+    @property
+    def remedy(self) -> str:
+        """What can be done when nothing can be told."""
+        verdict = self.alignment.verdict
+        return _UNSURE if verdict.accepted else verdict.remedy
+
 
 def explanation(
     outcome: CheckOutcome, misalignment: Misalignment, alignment: Alignment, limit_px: float
@@ -165,8 +175,9 @@ def check_text(check: Check) -> str:
     """A few lines for people: the verdict, what it rests on, and a table of the bands."""
     lines = [verdict_line(check)]
     if check.alignment.verdict.accepted:
-        lines += [_motion_line(check), _local_line(check)]
-        lines.append(accuracy_line(check.alignment))
+        if check.raster_outcome is not CheckOutcome.CANNOT_TELL:
+            lines.append(_motion_line(check))
+        lines += [_local_line(check), accuracy_line(check.alignment)]
     if check.alignment.masks:
         lines.append(masks_line(check.alignment))
     if check.bands is not None:

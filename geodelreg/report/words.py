@@ -235,6 +235,8 @@ def advice(alignment: Alignment, check: Check | None = None) -> str:
         return as_typed(alignment.verdict.remedy)
     if check is None:
         return as_typed(_sentence(next_line(alignment).removeprefix("Next: ")))
+    if check.outcome is CheckOutcome.CANNOT_TELL:
+        return as_typed(check.remedy)
     if check.outcome is CheckOutcome.MISALIGNED:
         return "Correct the header with geodelreg align."
     return "Use the raster as it is."

@@ -77,6 +77,10 @@ def test_aligned_is_exit_0_and_touches_nothing(geodelreg: Command, pair: Path) -
     assert done.stdout.startswith("aligned.tif: aligned, off by at most 0.0")
     assert "tolerance 0.5 PAN px" in done.stdout
     assert done.stderr == ""
+    unsure = geodelreg("check", path.name, "pan.tif", "--tolerance", "0.001", cwd=pair)
+    assert unsure.returncode == 3
+    assert "would move" not in unsure.stdout
+    assert "larger tolerance (--tolerance)" in unsure.stderr
     assert snapshot(pair) == before
 
 

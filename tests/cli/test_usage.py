@@ -24,6 +24,7 @@ CASES = {
     "band zero": ((*OUT, "-b", "0"), "--band 0 is out of range"),
     "negative radius": ((*OUT, "--search-radius", "-1"), "--search-radius -1.0"),
     "scale below one": ((*OUT, "--max-scale", "0.5"), "--max-scale 0.5"),
+    "no uncertainty at all": ((*OUT, "--max-uncertainty", "0"), "--max-uncertainty 0.0 is out of"),
     "threads below zero": ((*OUT, "-j", "-2"), "--num-threads -2"),
     "creation option without value": ((*OUT, "--co", "COMPRESS"), "KEY=VALUE"),
     "warp onto GCPs": ((*OUT, "--warp", "--georef", "gcps"), "exclude each other"),

@@ -46,6 +46,8 @@ def test_a_band_is_held_against_the_others_whatever_it_looks_like(
     assert not warned(geodelreg.align(ms, pan, agreeing_bands=(1, 2)))
     one = geodelreg.check(ms, pan, agreeing_bands=(2, 4))
     assert one.outcome.value == "cannot_tell"
+    assert one.remedy == one.alignment.verdict.remedy
+    assert "`per_band=True`" in one.remedy
 
 
 def test_between_half_a_pixel_and_one_the_bands_are_named_in_a_warning(tmp_path: Path) -> None:

@@ -97,6 +97,9 @@ def test_a_tolerance_below_the_standard_error_is_not_decided(write_ms: WriteMs) 
     found = geodelreg.check(write_ms(transform=corrected, name="exact"), PAN, limit_px=0.001)
     assert found.outcome is CheckOutcome.CANNOT_TELL
     assert "standard error" in found.reason
+    assert "`limit_px`" in found.remedy
+    assert "`search_radius_px`" not in found.remedy
+    assert "would move" not in check_text(found)
 
 
 def test_a_band_that_is_shifted_is_named(write_ms: WriteMs) -> None:
