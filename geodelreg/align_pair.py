@@ -206,7 +206,7 @@ def conclude(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = Fals
     options = pair.options
     with pair.timings("evidence"):
         carried = carry(pair, found, heard, bent)
-        notes = (*carried.warnings(options), *bands_warning(carried.evidence))
+        notes = (*carried.warnings(options), *bands_warning(carried.evidence, options.per_band))
     refined, fitted = carried.refined, carried.fitted
     model, reasons = fitted.selection.estimate.model, judge(carried.evidence, options)
     bands: tuple[BandMap, ...] = ()

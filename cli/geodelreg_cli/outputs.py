@@ -108,7 +108,9 @@ def check_targets(
         if created is not None and folder == created.absolute() and not folder.exists():
             folder = folder.parent
         if not folder.is_dir():
-            raise unwritable(target, FileNotFoundError(errno.ENOENT, "no such folder"))
+            there = next(path for path in (folder, *folder.parents) if path.exists())
+            code = errno.ENOENT if there.is_dir() else errno.ENOTDIR
+            raise unwritable(target, OSError(code, "no such folder"))
         if not os.access(folder, os.W_OK):
             raise unwritable(target, PermissionError(errno.EACCES, "permission denied"))
 

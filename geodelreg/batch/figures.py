@@ -11,8 +11,14 @@ from geodelreg.values.result import Alignment, Misalignment
 
 
 def figures_of(alignment: Alignment) -> dict[str, float | str | None]:
-    """`FIGURES` of an alignment; those that only a check measures are None."""
+    """`FIGURES` of an alignment; those that only a check measures are None.
+
+    So are the correction and its accuracy after a refusal: nothing was corrected.
+    """
     accuracy, motion = alignment.accuracy, header_motion(alignment)
+    evidence = {"coverage": accuracy.coverage, "tie_points": accuracy.kept}
+    if not alignment.verdict.accepted:
+        return dict.fromkeys(FIGURES) | _known(evidence)
     found: dict[str, float | str] = {
         "model": alignment.correction.model,
         "offset_px": motion.distance_px,
@@ -22,10 +28,8 @@ def figures_of(alignment: Alignment) -> dict[str, float | str | None]:
         "check_rmse_m": accuracy.check_rmse_m,
         "check_ce90_px": accuracy.check_ce90_px,
         "sigma_corner_px": accuracy.sigma_corner_px,
-        "coverage": accuracy.coverage,
-        "tie_points": accuracy.kept,
     }
-    return dict.fromkeys(FIGURES) | _known(found)
+    return dict.fromkeys(FIGURES) | _known(found) | _known(evidence)
 
 
 def check_figures(misalignment: Misalignment) -> dict[str, float | str | None]:

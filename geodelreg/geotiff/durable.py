@@ -12,7 +12,7 @@ from geodelreg.errors import OutputUnwritableError
 
 _CAUSES = {
     errno.ENOENT: ("its folder does not exist", "Create the folder."),
-    errno.ENOTDIR: ("its folder does not exist", "Create the folder."),
+    errno.ENOTDIR: ("a file is where its folder should be", "Name another folder."),
     errno.EACCES: ("permission denied", "Choose a place you may write to."),
     errno.EPERM: ("permission denied", "Choose a place you may write to."),
     errno.EROFS: ("the file system is read-only", "Choose another place."),

@@ -146,16 +146,17 @@ def local_distortion(points: TiePoints) -> float:
     return float(np.sqrt(np.where(excess > doubt, excess, 0.0).sum()))
 
 
-def bands_warning(evidence: Evidence) -> tuple[str, ...]:
+def bands_warning(evidence: Evidence, per_band: bool) -> tuple[str, ...]:
     """What to say of MS bands that lie apart; nothing of bands that agree."""
     if not evidence.bands > BANDS_TOLD_PX:
         return ()
     note = (
         f"MS bands do not agree: {evidence.bands_words} (by {evidence.bands:.2g} PAN px at least); "
-        "the correction is not right for both: `per_band=True` corrects each by itself, `band=N` "
-        "matches on one"
     )
-    return (note,)
+    if per_band:
+        return (note + "`per_band=True` finds a place for each",)
+    remedy = "`per_band=True` corrects each by itself, `band=N` matches on one"
+    return (f"{note}the correction is not right for both: {remedy}",)
 
 
 def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:

@@ -96,16 +96,11 @@ def index(rows: Iterable[Row]) -> str:
         outcomes=[(name, _WORDS[name], counts[name]) for name in _WORST_FIRST if counts[name]],
         figures=known,
         rows=[
-            (row, _WORDS[row.outcome], [_cell(_figure(row, name)) for name, _, _ in known])
+            (row, _WORDS[row.outcome], [_cell(row.figures.get(name)) for name, _, _ in known])
             for row in shown
         ],
         map=_map(shown),
     )
-
-
-def _figure(row: Row, name: str) -> Any:
-    """A number of a pair; a refused one has no offset, for nothing is believed of it."""
-    return None if (row.outcome, name) == ("refused", "offset_px") else row.figures.get(name)
 
 
 def _cell(value: Any) -> tuple[str, str]:

@@ -34,9 +34,11 @@ _REMEDIES = (
     (
         {"rival_motion"},
         (
-            "Much of the ground moves otherwise. Mask clouds (`mask`); where the ground bends, as "
-            "over relief or under a moving sensor, `warp=True` follows it, if enough of it can be "
-            "matched; of a repeated pattern, `band` may name a band that shows more."
+            "Much of the ground moves otherwise. Mask clouds (`mask`); cut a raster of which a "
+            "part is displaced there (gdal_translate -srcwin), and align each part; where the "
+            "ground bends, as over relief or under a moving sensor, `warp=True` follows it, if "
+            "enough of it can be matched; of a repeated pattern, `band` may name a band that shows "
+            "more."
         ),
     ),
     (

@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
         (("-o", "ms.tif", "--overwrite"), 2, "ms.tif is the input ms.tif", "--in-place"),
         (("-o", "sub/../pan.tif", "--overwrite"), 2, "is the input pan.tif", "--in-place"),
         (("-o", "missing/new.tif"), 1, "its folder does not exist", "Create the folder"),
-        (("-o", "old.tif/new.tif"), 1, "its folder does not exist", "Create the folder"),
+        (("-o", "old.tif/new.tif"), 1, "a file is where its folder should be", "another folder"),
         (("-o", "sub"), 1, "sub is a folder", "ms.tif"),
         (("-o", "new.tif", "--figure", "sub"), 1, "sub cannot be written: it is a folder", "file"),
         (("--in-place", "--report", "old.json"), 1, "old.json exists", "--overwrite"),

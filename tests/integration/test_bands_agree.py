@@ -56,7 +56,10 @@ def test_between_half_a_pixel_and_one_the_bands_are_named_in_a_warning(tmp_path:
     (text,) = (warning for warning in alignment.warnings if "bands do not agree" in warning)
     assert "band 4 lies" in text
     assert "of band 2" in text
-    assert "`per_band=True`" in text
+    assert "not right for both: `per_band=True`" in text
+    alignment = geodelreg.align(ms, pan, per_band=True)
+    (text,) = (warning for warning in alignment.warnings if "bands do not agree" in warning)
+    assert text.endswith("; `per_band=True` finds a place for each")
 
 
 def test_a_band_that_only_looks_unlike_pan_is_not_apart(tmp_path: Path) -> None:

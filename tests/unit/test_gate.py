@@ -178,6 +178,7 @@ def test_of_a_refused_alignment_nothing_is_written(tmp_path: Path) -> None:
         ({"sigma_px": 2.0}, "simpler `model`"),
         ({"support": 0.1}, "same ground"),
         ({"rival_motion": 0.9}, "`warp=True`"),
+        ({"rival_motion": 0.9}, "a part is displaced"),
     ],
 )
 def test_a_refusal_says_what_can_be_done_here(names: dict[str, float], word: str) -> None:
