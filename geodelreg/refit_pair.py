@@ -296,13 +296,15 @@ def _warnings(given: GivenPoints, points: TiePoints, sigma_px: float, with_pan: 
     if unsure.sum() == given.enabled.sum():
         notes.append("no point says how sure it is: all count the same")
     elif unsure.any():
+        by_hand = "1 point was" if unsure.sum() == 1 else f"{unsure.sum()} points were"
         notes.append(
-            f"{unsure.sum()} points were placed by hand ({_listed(given, unsure)}): they count as "
+            f"{by_hand} placed by hand ({_listed(given, unsure)}), which counts as "
             f"{_BY_EYE_PX:g} coarser px uncertain"
         )
     far = given.enabled & (points.status == Status.RESIDUAL)
     if far.any():
-        notes.append(f"{far.sum()} enabled points lie far from the fit: {_listed(given, far)}")
+        lie = "1 enabled point lies" if far.sum() == 1 else f"{far.sum()} enabled points lie"
+        notes.append(f"{lie} far from the fit: {_listed(given, far)}")
     if sigma_px > _DOUBTFUL_PX:
         notes.append(f"at a corner the correction is uncertain by {sigma_px:.2g} PAN px")
     return notes

@@ -274,5 +274,8 @@ def moves_pair(pair: Pair, correction: PixelMap) -> bool:
 
 def _reason(name: str, value: float, relation: str, limit: float, what: str) -> Reason:
     passed = value >= limit if relation == "≥" else value <= limit
-    message = f"{value:.4g} {what} (needs {relation} {limit:g})"
+    number = f"{value:.4g}"
+    if number == "1":
+        what = what.replace("points agree", "point agrees").replace("patches agree", "patch agrees")
+    message = f"{number} {what} (needs {relation} {limit:g})"
     return Reason(name, float(value), float(limit), bool(passed), message)

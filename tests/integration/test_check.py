@@ -22,6 +22,7 @@ from geodelreg.judge.check import is_affine_enough, judge_misalignment
 from geodelreg.judge.words import local_distortion
 from geodelreg.product.check import check_dict, check_text
 from geodelreg.product.report import report_schema
+from geodelreg.report.words import advice
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import CheckOutcome, Misalignment
@@ -100,6 +101,7 @@ def test_a_tolerance_below_the_standard_error_is_not_decided(write_ms: WriteMs) 
     assert "`limit_px`" in found.remedy
     assert "`search_radius_px`" not in found.remedy
     assert "would move" not in check_text(found)
+    assert "larger tolerance" in advice(found.alignment, found)
 
 
 def test_a_band_that_is_shifted_is_named(write_ms: WriteMs) -> None:

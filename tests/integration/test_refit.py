@@ -192,7 +192,10 @@ def test_a_dragged_point_counts_little_and_is_measured_when_asked(
     plain = geodelreg.refit(edited, MS, PAN, model="affine")
     assert error_px(plain, at) == pytest.approx(3.0, abs=0.3)
     assert apart_px(plain.correction.corrected, TRUE) < 0.02
-    assert any(f"placed by hand ({name})" in note for note in plain.warnings)
+    assert any(note.startswith(f"1 point was placed by hand ({name})") for note in plain.warnings)
+    drag(exported / "all.geojson", tmp_path / "far.geojson", 900.0, 40)
+    far = geodelreg.refit(tmp_path / "far.geojson", MS, PAN, model="affine")
+    assert f"1 enabled point lies far from the fit: {name}" in far.warnings
     snapped = geodelreg.refit(edited, MS, PAN, model="affine", snap=True)
     assert error_px(snapped, at) < 0.2
     assert snapped.tie_points.sigma_px[int(at)].max() < 0.2

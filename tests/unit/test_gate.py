@@ -186,6 +186,23 @@ def test_a_refusal_says_what_can_be_done_here(names: dict[str, float], word: str
     assert word in verdict(judge(evidence, AlignOptions()), moves=True).remedy
 
 
+@pytest.mark.parametrize(
+    ("points", "rival", "said"),
+    [
+        (1, 1.0, {"1 tie point agrees (needs ≥ 8)", "1 patch agrees"}),
+        (
+            5,
+            0.9,
+            {"5 tie points agree (needs ≥ 8)", "0.9 patches agree"},
+        ),
+    ],
+)
+def test_one_is_singular(points: int, rival: float, said: set[str]) -> None:
+    reasons = judge(replace(GOOD, points=points, rival_motion=rival), AlignOptions())
+    messages = [reason.message.partition(" on another")[0] for reason in reasons]
+    assert said <= set(messages)
+
+
 def test_a_correction_beyond_what_was_allowed_names_the_limits() -> None:
     far = replace(GOOD, shift_px=40.0)
     found = verdict(judge(far, AlignOptions(max_shift_px=9.0)), moves=True)
