@@ -40,7 +40,7 @@ def apply(
     options : WriteOptions, optional
         Its `warp` resamples, which a field needs.
     force : bool
-        Also where the file lies elsewhere than the raster that was aligned.
+        Also where the file lies elsewhere than the raster that was aligned, or was corrected.
     allow : str
         What may be opened, as in `AlignOptions`.
 
@@ -54,7 +54,7 @@ def apply(
     ReportError
         `correction` is broken, of another kind, or of a refusal.
     CorrectionMisfitError
-        `source` lies elsewhere.
+        `source` lies elsewhere, or was corrected before.
     UsageError
         No header holds the correction.
     OutputExistsError, OutputUnwritableError, ...
@@ -101,6 +101,7 @@ def _apply_to_raster(
         grid, count = reader.grid, len(reader.band_names)
     if not force:
         stored.check_fits(str(file), grid)
+        stored.check_uncorrected(file)
     correction, placement = stored.of_raster(grid)
     apart = stored.of_bands(str(file), grid, count)
     bent = placement is not None or any(held is not None for _, held in apart.values())

@@ -137,7 +137,7 @@ class ReportError(GeodelregError):
 
 
 class CorrectionMisfitError(GeodelregError):
-    """A file does not lie where the correction that is applied to it was found."""
+    """A file does not lie where a correction was found, or was corrected before."""
 
 
 class VectorUnreadableError(GeodelregError):

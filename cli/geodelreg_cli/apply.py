@@ -53,7 +53,11 @@ Exit codes: 0 done, 1 failed, 2 wrong usage.
     "-o", "--output", type=FILE, metavar="OUT", help="Output; of several files the folder for them."
 )
 @click.option("--in-place", is_flag=True, help="Correct the headers of the files themselves.")
-@click.option("--force", is_flag=True, help="Also where a file lies elsewhere than MS did.")
+@click.option(
+    "--force",
+    is_flag=True,
+    help="Also where a file lies elsewhere than MS did, or was corrected before.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
 @click.option("-v", "--verbose", count=True, help="Print the steps; -vv everything.")
 @click.option("--debug", is_flag=True, help="Print a traceback with an error.")

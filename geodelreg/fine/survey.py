@@ -66,7 +66,7 @@ class Places:
 
 
 def survey(
-    overlay: Overlay, reach: int = REACH_PX, aside: tuple[bool, bool] = (False, False)
+    overlay: Overlay, reach: int = REACH_PX, grid: tuple[str, str] = ("flush", "flush")
 ) -> Places:
     """Correlate every patch with all places up to `reach` pixels away, from border to border.
 
@@ -75,8 +75,9 @@ def survey(
     overlay : Overlay
         The surface under the correction to be judged.
     reach : int
-    aside : (bool, bool)
-        Whether the grid of patches lies between where it is without, across and down.
+    grid : (str, str)
+        Of patches, across and down: ``flush`` with the borders, ``between`` those, or side by side
+        and ``centred``.
     """
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
@@ -85,8 +86,7 @@ def survey(
     height, width = template.shape
     padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
     across, down = (
-        _starts(length, size, between)
-        for length, between in zip((width, height), aside, strict=True)
+        _starts(length, size, how) for length, how in zip((width, height), grid, strict=True)
     )
     rows = []
     for top in down:
@@ -118,11 +118,12 @@ def survey(
     return Places(centre, move, score, here, textured > 0, brightest, size)
 
 
-def _starts(length: int, size: int, between: bool) -> list[int]:
-    """Where patches begin along an axis: the first and the last at a border, unless between."""
-    count = math.ceil(length / size) if length >= size else 0
-    at = np.linspace(0, max(length - size, 0), count).round().astype(int)
-    return [int(n) for n in ((at[:-1] + at[1:]) // 2 if between else at)]
+def _starts(length: int, size: int, how: str) -> list[int]:
+    """Where the patches of a grid begin along an axis."""
+    if length < size or how == "centred":
+        return list(range((length % size) // 2, length - size + 1, size))
+    at = np.linspace(0, length - size, math.ceil(length / size)).round().astype(int)
+    return [int(n) for n in ((at[:-1] + at[1:]) // 2 if how == "between" else at)]
 
 
 def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:

@@ -63,7 +63,9 @@ def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
         Each of one band alone.
     pair : Pair
     """
-    furthest = next(_gaps(_heard(found), pair), None)
+    asked = _must_agree(pair)
+    heard = _heard([one for one in found if one.band in asked])
+    furthest = next(_gaps(heard, pair), None)
     return BandsApart() if furthest is None else furthest.told(pair)
 
 

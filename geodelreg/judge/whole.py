@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geodelreg.fine.clouds import HeightParallax, height_parallax
-from geodelreg.fine.ground import Ground, find_ground, other_motions
+from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motions
 from geodelreg.fine.layers import CALM_PATCHES, ELSEWHERE
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
@@ -42,7 +42,9 @@ _CALM_RESIDUAL = 0.3
 _PLACED_SCORE = 0.5
 _SURE_Z = 3.0
 _FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
-_ASIDE = ((True, False), (False, True), (True, True))
+_GRIDS = (
+    ("centred", "centred"), ("between", "flush"), ("flush", "between"), ("between", "between"),
+)  # fmt: skip
 _SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
 _MOST_POINTS = 1000  # unexplained: ablate
 _PLACES = 200  # unexplained: ablate
@@ -184,13 +186,16 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     near = shared_by_neighbours(some.source, gap)
     textured = int((last.status != Status.TEXTURE).sum())
     calm = near.high_px <= _CALM_RESIDUAL * pair.options.max_residual_px
-    calm &= textured >= _FEW_PATCHES  # fewer leave out a border as wide as a small part
-    if calm and not refined.dark_only and kept.sum() >= _CALM_SHARE * textured:
-        return Whole(near, np.asarray(kept))
-    return _surveyed(guess, refined, correction, Whole(near, np.asarray(kept)))
+    calm &= not refined.dark_only and kept.sum() >= _CALM_SHARE * textured
+    agreed = Whole(near, np.asarray(kept))
+    if calm and textured >= _FEW_PATCHES:  # fewer leave out a border as wide as a small part
+        return agreed
+    return _surveyed(guess, refined, correction, agreed, calm)
 
 
-def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
+def _surveyed(
+    guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole, calm: bool
+) -> Whole:
     """Where every patch lies: the ground's, another motion's, or a cloud's."""
     part = refined.part
     template, _, surface = decimated(guess, refined, dark=False)
@@ -200,6 +205,9 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     if len(index) < FEWEST_POINTS:
         return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
+    still = int((np.hypot(*move.T) <= ANOTHER_PX).sum())
+    if calm and still >= _CALM_SHARE * places.textured.sum():
+        return agreed
     ground = _ground_of(places, index)
     to_full = ~part.template.grid.transform @ template.grid.transform
     unit = float(np.sqrt(abs(to_full.determinant)))
@@ -219,9 +227,9 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     if ground.look.explains and not gentle:
         return replace(agreed, clouds=ground.moving)
     moved, words = _other_motion(refined, places, index, ground, unit)
-    for aside in _ASIDE if len(places.centre) < _FEW_PATCHES else ():
+    for grid in _GRIDS if len(places.centre) < _FEW_PATCHES else ():
         if not moved:  # few patches may lie astride the edge of a part, all that it has
-            places = survey(images, aside=aside)
+            places = survey(images, grid=grid)
             index = np.flatnonzero(_placed(places))
             ground = _ground_of(places, index)
             if not ground.look.explains or gentle:

@@ -106,6 +106,14 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
     return {f"GEODELREG_{name}": text for name, text in sorted(tags.items()) if text}
 
 
+FINGERPRINTS = (
+    "GEODELREG_MS_FINGERPRINT",
+    "GEODELREG_PAN_FINGERPRINT",
+    "GEODELREG_POINTS_FINGERPRINT",
+)
+"""Tags that tell of which rasters, and points, a correction was found."""
+
+
 def written_tags(path: Path) -> dict[str, str]:
     """``GEODELREG_*`` tags that a raster carries; none when it is no raster of geodelreg's."""
     from rasterio.errors import RasterioError

@@ -16,6 +16,7 @@ from geodelreg.geo.grid import outline
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
+from geodelreg.product.provenance import FINGERPRINTS, provenance_tags, written_tags
 from geodelreg.product.reading import read_report
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
@@ -131,6 +132,22 @@ class StoredCorrection:
         common = seen.intersection(frame).area / max(min(seen.area, frame.area), 1e-9)
         self.check_share(name, float(common))
 
+    def check_uncorrected(self, file: Path) -> None:
+        """Refuse a raster that was corrected by an alignment of the same pair.
+
+        Raises
+        ------
+        CorrectionMisfitError
+        """
+        found = {name: text for name, text in written_tags(file).items() if name in FINGERPRINTS}
+        if found and all(self.tags.get(name) == text for name, text in found.items()):
+            raise CorrectionMisfitError(
+                f"{file} was corrected before, by an alignment of the same rasters: once more "
+                "would move it off again",
+                "Apply it to the file as it was (`revert` takes an edit in place back), or add "
+                "`force=True`.",
+            )
+
     def check_share(self, name: str, share: float) -> None:
         """Refuse a file of which too little lies in the raster that was aligned.
 
@@ -186,7 +203,7 @@ def read_correction(path: Path) -> StoredCorrection:
         "GEODELREG_APPLIED": path.name,
         "GEODELREG_MODEL": correction.model,
         "GEODELREG_VERSION": __version__,
-    }
+    } | {name: text for name, text in provenance_tags(alignment).items() if name in FINGERPRINTS}
     reference = alignment.reference.grid
     aligned = alignment.verdict.outcome is Outcome.ALIGNED
     bands = {band.number: band.map for band in alignment.solution.bands} if aligned else {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -316,3 +317,24 @@ def test_several_files_go_to_a_folder_all_or_none(scene: tuple[Path, Path]) -> N
     run = CliRunner().invoke(cli, command)
     assert isinstance(run.exception, CorrectionMisfitError)
     assert not list(out.with_name("two").iterdir())
+
+
+def test_what_was_corrected_is_not_corrected_again_unless_forced(tmp_path: Path) -> None:
+    """By the alignment, and by its report, in another file and in place."""
+    pair = tmp_path / "ms.tif", tmp_path / "pan.tif"
+    for path in pair:
+        shutil.copy(Path(__file__).parents[2] / "sample_tiles" / path.name, path)
+    alignment = geodelreg.align(*pair)
+    report, aligned, mask = (tmp_path / name for name in ("r.json", "aligned.tif", "mask.tif"))
+    report.write_text(report_json(alignment))
+    geodelreg.write(alignment, aligned)
+    shutil.copy(pair[0], mask)
+    geodelreg.apply(report, mask)
+    for file, target in ((mask, None), (aligned, tmp_path / "twice.tif")):
+        before = file.read_bytes()
+        with pytest.raises(CorrectionMisfitError, match="was corrected before"):
+            geodelreg.apply(report, file, target)
+        assert file.read_bytes() == before
+    geodelreg.revert(mask)
+    geodelreg.apply(report, mask)
+    geodelreg.apply(report, mask, force=True)

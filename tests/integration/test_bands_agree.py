@@ -67,6 +67,16 @@ def test_a_band_that_only_looks_unlike_pan_is_not_apart(tmp_path: Path) -> None:
     assert not warned(geodelreg.align(ms, pan))
 
 
+def test_a_band_that_need_not_agree_may_lie_anywhere(tmp_path: Path) -> None:
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=((8.0, 0.0), STILL, STILL, STILL))
+    write_scene(scene, tmp_path)
+    pair = tmp_path / "ms.tif", tmp_path / "pan.tif"
+    with pytest.raises(AlignmentRefusedError, match="band 1 lies 8"):
+        geodelreg.align(*pair)
+    alignment = geodelreg.align(*pair, agreeing_bands=(2, 3, 4))
+    assert not warned(alignment)
+
+
 def test_bands_to_agree_exist_and_are_more_than_one() -> None:
     with pytest.raises(UsageError, match="one band"):
         AlignOptions(agreeing_bands=(3,))

@@ -185,7 +185,6 @@ def test_no_field_follows_clouds(tmp_path: Path) -> None:
 
 SMALL_TEARS = {
     "nearly half": (360, 4.0, None, (3.0, 20.0), 0.4),
-    "a row of patches, one of them misplaced": (332, 4.0, (216.0, 476.0), (-2.3, -9.3), 0.199),
     "not far": (400, 2.0, (440.0, 452.0), (3.75, 0.73), 0.168),
     "part of it beyond PAN": (400, 4.0, (567.0, 268.0), (-10.9, 26.6), 0.26),
 }
