@@ -15,7 +15,7 @@ _AMONG = 0.5
 a part that is torn off has still neighbours along its edge alone."""
 _LOG_CHANCE = -2.0
 """Of patches that outshine their neighbours: one alarm in a hundred pairs that are bent."""
-_OUTSHINING = 0.75
+OUTSHINING = 0.75
 """Share of the sum of ranks that patches which outshine their neighbours must hold: 0.85 to 0.96
 over clouds; of ground that is bent or torn a half, and 0.62 at most.  Many patches make chance
 unlikely where one end of a scene is a little brighter."""
@@ -49,7 +49,7 @@ class CloudLook:
     @property
     def explains(self) -> bool:
         """True when clouds are the better explanation than a bent or torn ground."""
-        likely = self.log_chance <= _LOG_CHANCE and self.outshining >= _OUTSHINING
+        likely = self.log_chance <= _LOG_CHANCE and self.outshining >= OUTSHINING
         return likely and self.among >= _AMONG
 
 

@@ -66,9 +66,9 @@ class Places:
 
 
 def survey(
-    overlay: Overlay, reach: int = REACH_PX, grid: tuple[str, str] = ("flush", "flush")
+    overlay: Overlay, reach: int = REACH_PX, grid: tuple[str, str] = ("centred", "centred")
 ) -> Places:
-    """Correlate every patch with all places up to `reach` pixels away, from border to border.
+    """Correlate every patch with all places up to `reach` pixels away.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def survey(
         The surface under the correction to be judged.
     reach : int
     grid : (str, str)
-        Of patches, across and down: ``flush`` with the borders, ``between`` those, or side by side
-        and ``centred``.
+        Of patches, across and down: side by side and ``centred``, ``flush`` with the borders, or
+        ``between`` those.
     """
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fine.clouds import HeightParallax, height_parallax
+from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
 from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motions
 from geodelreg.fine.layers import CALM_PATCHES, ELSEWHERE
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
-from geodelreg.fine.motions import largest_layer
-from geodelreg.fine.overlay import overlay
+from geodelreg.fine.motions import LEAST_PATCHES, largest_layer
+from geodelreg.fine.overlay import Overlay, overlay
 from geodelreg.fine.passes import Refinement, bends_gently
 from geodelreg.fine.survey import REACH_PX, Places, survey
 from geodelreg.fine.tone import single_band
@@ -32,7 +32,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Status
-from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
+from geodelreg.values.raster import Band, BoolArray, FloatArray, IntArray, StatusArray
 from geodelreg.values.result import Accuracy
 
 _CALM_SHARE = 0.98
@@ -43,7 +43,7 @@ _PLACED_SCORE = 0.5
 _SURE_Z = 3.0
 _FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
 _GRIDS = (
-    ("centred", "centred"), ("between", "flush"), ("flush", "between"), ("between", "between"),
+    ("flush", "flush"), ("between", "flush"), ("flush", "between"), ("between", "between"),
 )  # fmt: skip
 _SURVEY_SIGMA_PX = 0.05  # unexplained: ablate
 _MOST_POINTS = 1000  # unexplained: ablate
@@ -188,14 +188,45 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     calm = near.high_px <= _CALM_RESIDUAL * pair.options.max_residual_px
     calm &= not refined.dark_only and kept.sum() >= _CALM_SHARE * textured
     agreed = Whole(near, np.asarray(kept))
-    if calm and textured >= _FEW_PATCHES:  # fewer leave out a border as wide as a small part
+    if not calm:
+        return _surveyed(guess, refined, correction, agreed)
+    if textured >= _FEW_PATCHES:
         return agreed
-    return _surveyed(guess, refined, correction, agreed, calm)
+    # few patches leave out a border as wide as a small part
+    template, _, surface = decimated(guess, refined, dark=False)
+    images = overlay(refined.part, template, surface, correction)
+    moved, words = _small_motion(refined, images, _unit(refined, template))
+    return replace(agreed, moved=moved, words=words)
 
 
-def _surveyed(
-    guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole, calm: bool
-) -> Whole:
+def _unit(refined: Refinement, template: Band) -> float:
+    """Pixels of full resolution in one of a decimated image, along an axis."""
+    to_full = ~refined.part.template.grid.transform @ template.grid.transform
+    return float(np.sqrt(abs(to_full.determinant)))
+
+
+def _small_motion(refined: Refinement, images: Overlay, unit: float) -> tuple[float, str]:
+    """The same as `_other_motion` of patches on other grids, where there are few on one.
+
+    A part no wider than a patch or two lies astride two rows of one grid, and fills a row of
+    another.  Of so few patches brightness proves no cloud; a part that is bright is left to clouds.
+    """
+    for grid in _GRIDS:
+        places = survey(images, grid=grid)
+        index = np.flatnonzero(_placed(places))
+        gone = np.hypot(*places.move[index].T) > ANOTHER_PX
+        if gone.sum() < LEAST_PATCHES or (~gone).sum() < FEWEST_POINTS:
+            continue
+        ground = _ground_of(places, index)
+        if ground.look.outshining >= OUTSHINING:
+            continue
+        moved, words = _other_motion(refined, places, index, ground, unit)
+        if moved:
+            return moved, words
+    return 0.0, ""
+
+
+def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
     """Where every patch lies: the ground's, another motion's, or a cloud's."""
     part = refined.part
     template, _, surface = decimated(guess, refined, dark=False)
@@ -205,12 +236,9 @@ def _surveyed(
     if len(index) < FEWEST_POINTS:
         return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
-    still = int((np.hypot(*move.T) <= ANOTHER_PX).sum())
-    if calm and still >= _CALM_SHARE * places.textured.sum():
-        return agreed
     ground = _ground_of(places, index)
     to_full = ~part.template.grid.transform @ template.grid.transform
-    unit = float(np.sqrt(abs(to_full.determinant)))
+    unit = _unit(refined, template)
     unseen = refined.dark_only | (np.hypot(*move.T) * unit > MAX_MOVE * part.step)
     far = ground.member & unseen
     linear = affine_matrix(to_full)[:, :2] * _SURVEY_SIGMA_PX
@@ -227,13 +255,8 @@ def _surveyed(
     if ground.look.explains and not gentle:
         return replace(agreed, clouds=ground.moving)
     moved, words = _other_motion(refined, places, index, ground, unit)
-    for grid in _GRIDS if len(places.centre) < _FEW_PATCHES else ():
-        if not moved:  # few patches may lie astride the edge of a part, all that it has
-            places = survey(images, grid=grid)
-            index = np.flatnonzero(_placed(places))
-            ground = _ground_of(places, index)
-            if not ground.look.explains or gentle:
-                moved, words = _other_motion(refined, places, index, ground, unit)
+    if not moved and len(places.centre) < _FEW_PATCHES:
+        moved, words = _small_motion(refined, images, unit)
     if moved or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
