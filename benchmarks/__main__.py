@@ -21,6 +21,10 @@ COMMANDS = {
         "the standard error where PAN and MS see different light",
     ),
     "gate": ("benchmarks.gate.run", "false accepts and false refusals of the gate"),
+    "constants": (
+        "benchmarks.gate.constants",
+        "the method's numbers that were chosen by hand, halved and doubled",
+    ),
     "ablate": ("benchmarks.gate.ablate", "the method's rules switched off, one at a time"),
     "bent": ("benchmarks.gate.bent", "pairs bent, torn, coloured or framed: what is said of them"),
     "peers": ("benchmarks.peers.run", "geodelreg and its peers side by side"),

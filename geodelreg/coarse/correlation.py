@@ -14,15 +14,15 @@ import numpy as np
 from geodelreg.fine.overlay import Overlay
 from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
 
-_PIXELS = 90_000  # at most, 300²; unexplained: ablate
-_SEARCH_OVERLAP = 0.15  # of the smaller image; unexplained: ablate
+_PIXELS = 90_000  # at most, 300²; by hand: ½ to 2 × alike
+_SEARCH_OVERLAP = 0.15  # of the smaller image; by hand: ½ to 2 × alike
 _HIGH_PASS_SIGMA_PX = 4.0
 _CLIP_SIGMAS = 3.0
 _ALL_VALID = 0.99  # share of a pixel, when decimated; the rest is rounding
 _LEAST_SHARE = 1e-3  # of weight: means of less are not asked for
 _LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
 _VERTEX_STEPS = 32  # a pixel: finer than the parabola is true
-_PEAK_PX = 8  # further off is another place; unexplained: ablate
+_PEAK_PX = 8  # further off is another place; by hand: ½ to 2 × alike
 
 
 class Shift(NamedTuple):

@@ -13,10 +13,10 @@ from geodelreg.pair import Pair
 from geodelreg.values.points import Overview, Scope
 from geodelreg.values.raster import Window
 
-_FIRST_BUDGET_PX = 250_000  # 500²; unexplained: ablate
+_FIRST_BUDGET_PX = 250_000  # 500²; by hand: ½ to 2 × alike
 _FINER_BUDGET_PX = 1_000_000  # 1000²: twice as fine
-SECOND_BUDGET_PX = 1_600_000  # 1265²; unexplained: ablate
-_FIRST_KEYPOINTS = 1500  # of each image, and a quarter of what is asked for; unexplained: ablate
+SECOND_BUDGET_PX = 1_600_000  # 1265²; by hand: ½ to 2 × alike
+_FIRST_KEYPOINTS = 1500  # of each image, a quarter of what is asked for; by hand: ½ to 2 × alike
 _FINER = 1.01  # times finer; less is rounding to whole pixels
 
 

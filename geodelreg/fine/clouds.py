@@ -22,9 +22,9 @@ unlikely where one end of a scene is a little brighter."""
 _PARALLAX_R2 = 0.65
 """Share of the motion that the bands' parallax must explain: 0.74 and 0.96 over real clouds, 0.43
 at most over ground, where unlike bands look different."""
-_NO_PARALLAX_SIGMAS = 2.5  # unexplained: ablate
-_MOST_PERCENT = 95  # unexplained: ablate
-_FEWEST = 30  # unexplained: ablate
+_NO_PARALLAX_SIGMAS = 2.5  # by hand: ½ to 2 × alike
+_MOST_PERCENT = 95  # by hand: ½ to 2 × alike
+_FEWEST = 30  # by hand: ½ to 2 × alike
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,33 +32,33 @@ LOCAL_RMS_PX = 0.3
 """Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
 
 _GREYS = 256  # bins of the histogram, as in an image of 8 bit
-_RANGE_PERCENT = (0.5, 99.5)  # outliers in half a percent; unexplained: ablate
+_RANGE_PERCENT = (0.5, 99.5)  # outliers in half a percent; by hand: ½ to 2 × alike
 _LEAST_VALUES = 256  # one to a bin
-_LEAST_BRIGHT, _MOST_BRIGHT = 0.01, 0.9  # share of the image; unexplained: ablate
-_GROWTH_PX = 5  # unexplained: ablate
-_SEPARATION = 3.5  # standard deviations of the dark class; unexplained: ablate
+_LEAST_BRIGHT, _MOST_BRIGHT = 0.01, 0.9  # share of the image; by hand: ½ to 2 × alike
+_GROWTH_PX = 5  # by hand: 2 × refuses 1 of 36
+_SEPARATION = 3.5  # standard deviations of the dark class; by hand: ½ to 2 × alike
 _LEAST_SPREAD = 1e-4  # of the value: beyond the rounding of float32, whose digits are 6e-8
 
-_CALM_MATCHES = 0.8  # unexplained: ablate
-_CONTRADICTION_PX = 1.5  # of the overview; unexplained: ablate
+_CALM_MATCHES = 0.8  # by hand: ½ to 2 × alike
+_CONTRADICTION_PX = 1.5  # of the overview; by hand: 2 × refuses 1 of 36
 
-_MIXED_SIGMA = 0.03  # of a patch pixel; unexplained: ablate
+_MIXED_SIGMA = 0.03  # of a patch pixel; by hand: ½: 1 of 36 twice as far off
 
-CALM_PATCHES = 0.9  # unexplained: ablate
-CALM_SIGMA_PX = 0.02  # unexplained: ablate
+CALM_PATCHES = 0.9  # by hand: 0.8: 1 of 36 2.6 times as far off
+CALM_SIGMA_PX = 0.02  # by hand: ½ to 2 × alike
 _TELLING_PATCHES = 8  # fewer on the ground say nothing against what all others agree on
 _CONTRADICTION_SIGMAS = 4.0
-_CONTRADICTION_FLOOR_PX = 0.05  # of MS; unexplained: ablate
+_CONTRADICTION_FLOOR_PX = 0.05  # of MS; by hand: ½ to 2 × alike
 _RELIEF_SIGMAS = 2.0
 _STILL_PX = 0.4
 """Of a patch pixel: clouds of real Landsat pairs move by 0.45 to 1.3, unlike bands by up to 0.3."""
 _STILL_SHARE = 0.98  # fewer than so many see no cloud that could matter
-CLEARLY = 0.8  # of the standard error; unexplained: ablate
+CLEARLY = 0.8  # of the standard error; by hand: ½ to 2 × alike
 
-_RIVAL_TOLERANCE = 0.2  # of a patch pixel; unexplained: ablate
+_RIVAL_TOLERANCE = 0.2  # of a patch pixel; by hand: ½ to 2 × alike
 _RIVAL_SIGMA = 0.5
-SURE_LOG_NFA = -12.0  # as sure as 40 bits; unexplained: ablate
-_MANY_ELSEWHERE = 0.3  # share of the patches that matched; unexplained: ablate
+SURE_LOG_NFA = -12.0  # as sure as 40 bits; by hand: ½ to 2 × alike
+_MANY_ELSEWHERE = 0.3  # share of the patches that matched; by hand: ½ to 2 × alike
 
 
 def bright_threshold(band: Band) -> float | None:

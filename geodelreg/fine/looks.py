@@ -17,8 +17,8 @@ from geodelreg.pair import Roles
 from geodelreg.values.raster import Band
 
 _VISIBLE_BANDS = 3
-_MOVE_PX = 0.1  # of MS; unexplained: ablate
-_SHARPER_SHARE = 0.6  # unexplained: ablate
+_MOVE_PX = 0.1  # of MS; by hand: ½ to 2 × alike
+_SHARPER_SHARE = 0.6  # by hand: ½ to 2 × alike
 
 
 class Look(NamedTuple):
@@ -30,7 +30,8 @@ class Look(NamedTuple):
 
 PLAIN = Look(0.0, False)
 HAZE = Look(1.0, False)
-SHARPER = (Look(1.5, True), Look(1.0, True))  # unexplained: ablate
+SHARPER = (Look(1.5, True), Look(1.0, True))
+"""Without the second, eight of fifteen pairs are worse by a fifth to a half."""
 
 
 def band_looks(bands: list[Band]) -> Iterator[Band]:

@@ -25,10 +25,10 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import FloatArray, StatusArray
 
-_GROUP_PATCHES = 100  # unexplained: ablate
+_GROUP_PATCHES = 100  # by hand: ½ to 2 × alike
 _BAND_PATCHES = 100  # or a few more: the band's sigma is a tenth of a patch's
-_BANDS = 6  # evenly spread; unexplained: ablate
-_BAND_TILES = 8  # evenly spread; unexplained: ablate
+_BANDS = 6  # evenly spread; by hand: ½ to 2 × alike
+_BAND_TILES = 8  # evenly spread; by hand: ½ to 2 × alike
 
 
 def match_pass(

@@ -17,20 +17,20 @@ from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 MOST_STRAIN = 0.04
 """Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
-LEAST_SHARE = 0.05  # unexplained: ablate
+LEAST_SHARE = 0.05  # by hand: ½ to 2 × alike
 LEAST_PATCHES = 4
 """That agree on another motion: less than one pair in a thousand has so many by chance, and a
 raster of 40 patches has no more in a tenth of its area."""
 _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
-_SOLID = 0.9  # unexplained: ablate
-_ROUNDING_PX = 1e-6  # unexplained: ablate
+_SOLID = 0.9  # by hand: ½ to 2 × alike
+_ROUNDING_PX = 1e-6  # by hand: ½ to 2 × alike
 _CORE = 0.75
 """Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
 those astride a tear fit to both sides a little, and to neither well."""
 _MEDIAN_GAP = math.sqrt(4.0 * math.log(2.0) / 2.0)
 """Median distance of two points of unit radial standard error (Rayleigh's distribution)."""
-_NOISE_SIGMAS = 2.5  # unexplained: ablate
+_NOISE_SIGMAS = 2.5  # by hand: ½ to 2 × alike
 _SLIVER = 0.2
 """Altitude over longest side below which a triangle joins places along the hull, no neighbours."""
 

@@ -43,19 +43,19 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Overview, Status
 from geodelreg.values.raster import FloatArray
 
-COARSE_SIGMA = 0.35  # of a pixel; unexplained: ablate
+COARSE_SIGMA = 0.35  # of a pixel; by hand: 2 × refuses 1 of 36
 _PASSES = 2
 _PASSES_FROM_AFAR = 3
 _SOME_TILES = 2
-_MANY_TILES = 5  # unexplained: ablate
-_LAST_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
-_MANY_PATCHES = 200  # fewer follow the tone of the proof; unexplained: ablate
+_MANY_TILES = 5  # by hand: ½ to 2 × alike
+_LAST_TOLERANCE = 0.005  # of a patch pixel; by hand: ½ to 2 × alike
+_MANY_PATCHES = 200  # fewer follow the tone of the proof; by hand: ½ to 2 × alike
 _ONLY_TOLERANCE = 0.0015  # of a patch pixel, where no pass of full resolution goes before
-_LAST_ITERATIONS = 5  # unexplained: ablate
-_FEWER_SAMPLES = 4_000  # half of the last pass; unexplained: ablate
+_LAST_ITERATIONS = 5  # by hand: ½ to 2 × alike
+_FEWER_SAMPLES = 4_000  # half of the last pass; by hand: ½ to 2 × alike
 _NEAR_HEADER_PX = 4.0
-_COARSE_FROM = 1.5  # times coarser than full resolution; unexplained: ablate
-_MUCH_VISIBLE = 0.75  # unexplained: ablate
+_COARSE_FROM = 1.5  # times coarser than full resolution; by hand: ½ to 2 × alike
+_MUCH_VISIBLE = 0.75  # by hand: ½ to 2 × alike
 _MINORITY = 0.4
 """Share of the patches that agree, below which the others may have spoilt the tone: a robust fit
 breaks down at half, and patches at the edge of what shows something hold some of the rest."""

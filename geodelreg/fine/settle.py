@@ -26,9 +26,9 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
 from geodelreg.values.raster import FloatArray, IntArray, StatusArray
 
-_MOST_PASSES = 4  # unexplained: ablate
+_MOST_PASSES = 4  # by hand, untried
 _TUNED_PASSES = 2  # then tone and point spread are known
-_STANDS_STILL = 0.2  # of its standard error; unexplained: ablate
+_STANDS_STILL = 0.2  # of its standard error; by hand, untried
 _TONE_TILES = 120  # of a hundred samples each: weights of bands are then known to a percent
 _STEEP = 4.0
 """Patches within which the residual varies, below which smaller ones are tried."""
@@ -37,9 +37,9 @@ _FLATTENED = (25 + 25 + 2 * 25 / 3) ** 0.5 / 24
 1/24, the square's second moment, times the Laplacian, whose variance that is."""
 _NOISY = 2.0
 """Scatter over the patches' own errors, above which it may be variation within them."""
-_TOLERANCE = 0.005  # of a patch pixel; unexplained: ablate
-_ITERATIONS = 5  # of the first pass; unexplained: ablate
-_LATER_ITERATIONS = 3  # unexplained: ablate
+_TOLERANCE = 0.005  # of a patch pixel; by hand, untried
+_ITERATIONS = 5  # of the first pass; by hand, untried
+_LATER_ITERATIONS = 3  # by hand, untried
 
 
 @dataclass(frozen=True, slots=True, eq=False)

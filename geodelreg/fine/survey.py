@@ -24,7 +24,7 @@ _BRIGHTEST_PERCENT = 95  # what a cloud covers of a patch that it moves, at the 
 _COLUMNS = 8  # of what is noted of a patch, below
 _MOST_R = 0.999  # below 1, where Fisher's transformation ends
 _ROUNDED_R = 1.001  # above 1 by rounding; what lies beyond is flat
-_LEAST_VALID = 0.8  # unexplained: ablate
+_LEAST_VALID = 0.8  # by hand: ½ to 2 × alike
 _CORRELATION_LENGTH_PX = 2.0
 
 

@@ -16,15 +16,15 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Overview
 from geodelreg.values.raster import Band, BoolArray, Grid, Window
 
-PATCH_PX = 20  # square; unexplained: ablate
+PATCH_PX = 20  # square; by hand: ½: 1 of 36 refused, 1 four times as far off
 _SPREAD_TILE_PATCHES = 4
 _SPREAD_TILE_PATCHES_FINE = 3
-_FINE_RATIO = 2.5  # unexplained: ablate
-_ADJOINING_TILE_PATCHES = 8  # unexplained: ablate
+_FINE_RATIO = 2.5  # by hand: ½ to 2 × alike
+_ADJOINING_TILE_PATCHES = 8  # by hand: ½: 1 of 36 refused, 1 twice as far off
 _MEMO = 1
-SMALLEST_PATCH_PX = 12  # square; unexplained: ablate
-_WANTED_PATCHES = 40  # five times what the gate asks; unexplained: ablate
-_MOST_TILES_PER_AXIS = 7  # unexplained: ablate
+SMALLEST_PATCH_PX = 12  # square; by hand: 2 × refuses 5 of 36, ½: 1 thrice as far off
+_WANTED_PATCHES = 40  # five times what the gate asks; by hand: ½ refuses 1 of 36, 2 × too
+_MOST_TILES_PER_AXIS = 7  # by hand: ½ to 2 × alike
 _DENSE_TILES_PER_AXIS = 36  # of a patch each: as many points as a field is quickly solved for
 _USUAL_SIGMA = 0.7  # of a template pixel, the largest point spread that is usual
 _LOW_PASS_REACH = 4.0

@@ -9,22 +9,22 @@ import numpy as np
 
 from geodelreg.values.raster import MAD_TO_SIGMA, TINY, Band, BoolArray, Float32Array, FloatArray
 
-_SLICE = 512  # rows at a time; unexplained: ablate
+_SLICE = 512  # rows at a time; by hand: ½ to 2 × alike
 _TUKEY_WIDE = 4.0
-_MAX_CURVED_BANDS = 6  # they have 21 products; unexplained: ablate
+_MAX_CURVED_BANDS = 6  # they have 21 products; by hand: ½ to 2 × alike
 _WORTHWHILE = 0.97
-"""Of the spread: three percent of it are worth the curvature; unexplained: ablate."""
-_RANGE_PERCENT = (0.2, 99.8)  # unexplained: ablate
-_TUKEY_ROUNDS = 6  # unexplained: ablate
+"""Of the spread: three percent of it are worth the curvature; by hand: ½ to 2 × alike."""
+_RANGE_PERCENT = (0.2, 99.8)  # by hand: ½ to 2 × alike
+_TUKEY_ROUNDS = 6  # by hand: ½ to 2 × alike
 _RIDGE = 1e-6  # a sample, of standardised products: nothing beside their noise
-_ROUNDS = 12  # half of least absolute deviations, half of the biweight; unexplained: ablate
+_ROUNDS = 12  # half of least absolute deviations, half of the biweight; by hand: ½ to 2 × alike
 _TUKEY = 3.0
 _LEVERAGE = 3.0
-_CLEARLY = 0.7  # of the spread; unexplained: ablate
+_CLEARLY = 0.7  # of the spread; by hand: ½ to 2 × alike
 _GRAM_RIDGE = 1e-9  # of the mean power: nothing beside rounding of samples in float32
 _MOST_EXCHANGES = 1000  # of 12 bands, which have 4096 sets; a handful is usual
-_FLOOR = 1e-3  # of the target's spread; unexplained: ablate
-_LEAST_TRUST = 16.0  # samples' worth; unexplained: ablate
+_FLOOR = 1e-3  # of the target's spread; by hand: ½ to 2 × alike
+_LEAST_TRUST = 16.0  # samples' worth; by hand: ½ to 2 × alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)

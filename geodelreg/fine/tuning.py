@@ -18,15 +18,15 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Grid
 
 DEFAULT_SIGMA = 0.5
-_TONE_SAMPLES = 8_000  # unexplained: ablate
-LEAST_SAMPLES = 64  # unexplained: ablate
+_TONE_SAMPLES = 8_000  # by hand: ½ to 2 × alike
+LEAST_SAMPLES = 64  # by hand: ½ to 2 × alike
 _USUAL = (0.3, 0.4, 0.5, 0.6, 0.7)
 """Of a pixel: Gaussian point spreads that pass 0.64 to 0.09 of the contrast at Nyquist."""
 _SOFTER = (0.85, 1.0, 1.2, 1.45, 1.75)  # the coarser image was enlarged, or is out of focus
-_CLEARLY = 0.9  # of what is unlike; unexplained: ablate
+_CLEARLY = 0.9  # of what is unlike; by hand: ½ to 2 × alike
 _MUCH_UNLIKE = 0.5
-_PIXELS = 300_000  # of the finer image; unexplained: ablate
-_LEAST_SAMPLES = 32  # unexplained: ablate
+_PIXELS = 300_000  # of the finer image; by hand: ½ to 2 × alike
+_LEAST_SAMPLES = 32  # by hand: ½ to 2 × alike
 _SAMPLES = 8_000  # correlations are then known to 0.01
 
 

@@ -10,7 +10,7 @@ from geodelreg.values.raster import FloatArray, IntArray
 
 _LN_10 = math.log(10)  # between the bases
 _RESIDUAL_FLOOR_PX = 0.1
-"""Positions are no better, and a residual of 0 would prove everything; unexplained: ablate."""
+"""Positions are no better, and a residual of 0 would prove everything; by hand: ½ to 2 × alike."""
 
 
 def log_nfa(

@@ -23,14 +23,14 @@ from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
 
 _MEDIAN = 2 * np.log(2)  # of squared distances over variances, in the plane
 _LIMIT = 4.0  # standard deviations, as observed on the mesh, that a point may be off its star
-_MAX_STRAIN = 0.02  # sd of the gradient of local distortion, px per px; unexplained: ablate
+_MAX_STRAIN = 0.02  # sd of the gradient of local distortion, px per px; by hand: ½ to 2 × alike
 _MIN_SPREAD = 0.5  # the observed spread is believed down to this share of the stated sigmas
-_SIGMA_PX = 0.3  # of a match, per axis, where no covariance is given; unexplained: ablate
-_SURE = 16.0  # times a match's own variance; unexplained: ablate
+_SIGMA_PX = 0.3  # of a match, per axis, where no covariance is given; by hand: ½ to 2 × alike
+_SURE = 16.0  # times a match's own variance; by hand: ½ to 2 × alike
 _WORTHWHILE_GROWTH = 1.01  # one percent more points
 _MAX_FLIPPED_SHARE = 0.5
 _MAX_ROUNDS = 20  # it ends sooner; this is a bound
-_ROBUST_FIT_ROUNDS = 12  # unexplained: ablate
+_ROBUST_FIT_ROUNDS = 12  # by hand: ½ to 2 × alike
 _MIN_POINTS = 4
 _LEAST_GAP_PX = 1e-3  # so that no point weighs without bound
 _MIN_SIGMA_PX = 1e-4  # below what any image tells

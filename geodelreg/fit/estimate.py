@@ -13,16 +13,16 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 _MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
-_STUDENT_DOF = 6.0  # tails heavier than normal; unexplained: ablate
+_STUDENT_DOF = 6.0  # tails heavier than normal; by hand: ½ to 2 × alike
 REJECT_D2 = 25.0  # five standard deviations: of normal errors in the plane 4e-6 lie beyond
-_MOST_ROUNDS = 20  # unexplained: ablate
+_MOST_ROUNDS = 20  # by hand: ½ to 2 × alike
 _GAUSS_NEWTON_STEPS = 4  # from the identity; each squares an error of a percent or less
 _CONVERGED = 1e-9  # of half the raster: 1e-5 px of one of 20 000
 _RANK = 1e-13  # 450 times the rounding of float64
-_SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; unexplained: ablate
+_SPREAD_ROUNDS = 6  # then it stays, so that the weights converge; by hand: ½ to 2 × alike
 _CLOSE = 1e-4  # relative: far below the error of the variance itself
 _MOST_CUTS = 50  # of an interval; five or six are usual
-_MOST_LEVERAGE = 0.95  # a residual is magnified twentyfold at most; unexplained: ablate
+_MOST_LEVERAGE = 0.95  # a residual is magnified twentyfold at most; by hand: ½ to 2 × alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,11 +24,11 @@ FEWEST_POINTS = 12
 MOST_STRAIN = 0.04
 """Of a field that is believed: relief seen at 20° bends by less, a fold by much more."""
 _ROUNDS = 3
-_TUNING_POINTS = 160  # unexplained: ablate
-_LEAST_VARIANCE_PX2 = 1e-8  # unexplained: ablate
-_IMPOSSIBLE = 1e12  # unexplained: ablate
-_LEAST_NUGGET_PX2 = 1e-7  # unexplained: ablate
-_STEPS = 20  # unexplained: ablate
+_TUNING_POINTS = 160  # by hand: ½ to 2 × alike
+_LEAST_VARIANCE_PX2 = 1e-8  # by hand: ½ to 2 × alike
+_IMPOSSIBLE = 1e12  # by hand: ½ to 2 × alike
+_LEAST_NUGGET_PX2 = 1e-7  # by hand: ½ to 2 × alike
+_STEPS = 20  # by hand: ½ to 2 × alike
 _CLOSE = 1e-5  # relative: a hundredth of the likelihood that one unit of a kernel is worth
 _DIGITS = 2  # of the logarithms of a kernel: a percent, far below what points tell of it
 

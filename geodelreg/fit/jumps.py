@@ -18,7 +18,7 @@ from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.kriging import Kernel
 from geodelreg.values.raster import FloatArray, IntArray
 
-_MOST_JUMPS = 6  # unexplained: ablate
+_MOST_JUMPS = 6  # by hand, untried
 _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
 _CANDIDATES = 3

@@ -11,12 +11,12 @@ from geodelreg.geo.maps.field import FieldMap
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import TINY, FloatArray, IntArray
 
-_DRAWS = 400  # unexplained: ablate
-_ENDS = (2.5, 97.5)  # unexplained: ablate
+_DRAWS = 400  # by hand: ½ to 2 × alike
+_ENDS = (2.5, 97.5)  # by hand: ½ to 2 × alike
 _P95 = 95  # percent, as the name says
-_FEWEST = 30  # unexplained: ablate
+_FEWEST = 30  # by hand: ½ to 2 × alike
 _DIGITS = 9  # what the number of BLAS threads changes lies far below
-_BOUND = 6.0  # unexplained: ablate
+_BOUND = 6.0  # by hand: ½ to 2 × alike
 _P95_OVER_RMS = math.sqrt(math.log(20.0))
 """Of distances in the plane whose components are normal (Rayleigh's distribution)."""
 

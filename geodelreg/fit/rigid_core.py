@@ -10,11 +10,11 @@ from geodelreg.fit.consensus import consensus
 from geodelreg.fit.estimate import Observations
 from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
-_CORE_SIGMAS = 1.5  # of the patches' own noise; unexplained: ablate
-_CORE_FLOOR_PX = 0.03  # of a patch pixel; unexplained: ablate
-_GROWTH = 1.5  # of the tolerance from try to try; unexplained: ablate
-_SHIFT_SHARE = 0.15  # unexplained: ablate
-_AFFINE_SHARE = 0.25  # unexplained: ablate
+_CORE_SIGMAS = 1.5  # of the patches' own noise; by hand: 2 ×: 1 of 36 twice as far off
+_CORE_FLOOR_PX = 0.03  # of a patch pixel; by hand: ½ to 2 × alike
+_GROWTH = 1.5  # of the tolerance from try to try; by hand: ½ to 2 × alike
+_SHIFT_SHARE = 0.15  # by hand: ½ to 2 × alike
+_AFFINE_SHARE = 0.25  # by hand: ½ to 2 × alike
 _CORE_REACH = 2.0
 
 

@@ -18,8 +18,8 @@ from geodelreg.values.raster import FloatArray
 from geodelreg.values.result import Accuracy
 
 _E1_PIXELS = 40_000  # an RMSE of so many is known to 0.4 %
-_LEAST_PIXELS = 64  # of fewer nothing is said; unexplained: ablate
-_EDGE_PLACES = 8  # on each edge of a footprint; unexplained: ablate
+_LEAST_PIXELS = 64  # of fewer nothing is said; by hand: ½ to 2 × alike
+_EDGE_PLACES = 8  # on each edge of a footprint; by hand: ½ to 2 × alike
 _CE_PERCENT = 90  # as CE90 is defined
 
 SYSTEMATIC_PX = 0.0012

@@ -18,10 +18,10 @@ from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, BoolArray, FloatArray, IntArray
 
-_DISPLACED_RADII = (4.0, 9.0)  # patch pixels: beyond the texture's own width; unexplained: ablate
+_DISPLACED_RADII = (4.0, 9.0)  # patch pixels, beyond the texture's width; by hand: ½ to 2 × alike
 _DIRECTIONS = 8  # at each radius: 16 places
-_BY_CHANCE = 0.125  # twice 1/17: the best of 17 like places; unexplained: ablate
-_TESTED_PATCHES = 160  # unexplained: ablate
+_BY_CHANCE = 0.125  # twice 1/17: the best of 17 like places; by hand: ½ to 2 × alike
+_TESTED_PATCHES = 160  # by hand: ½ to 2 × alike
 _LEAST_DISPLACED = 8  # half of the places
 _RESEMBLES = MIN_CORRELATION**2  # share of the variance that is explained
 _FEWEST_TEXTURED = 8

@@ -12,12 +12,12 @@ from geodelreg.coarse.correlation import around, detail_pair, masked_correlation
 from geodelreg.fine.overlay import Overlay
 from geodelreg.values.raster import Float32Array, FloatArray
 
-_NEAR_PX = 8  # unexplained: ablate
+_NEAR_PX = 8  # by hand: 2 × refuses 1 of 36
 _PEAK_PX = 3
-_LEAST_COMMON = 1000  # pixels; unexplained: ablate
+_LEAST_COMMON = 1000  # pixels; by hand: ½ to 2 × alike
 _LEAST_POWER = 1e-6  # of standardised values: of less there is no texture
-_RIVALS = 5  # unexplained: ablate
-_RIVAL_OVERLAP = 0.2  # unexplained: ablate
+_RIVALS = 5  # by hand: ½ to 2 × alike
+_RIVAL_OVERLAP = 0.2  # by hand: ½ to 2 × alike
 _BLOCK_PX = 32  # of the image magnified twice
 _UNSUSPICIOUS = 0.5
 

@@ -50,7 +50,7 @@ _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 _UNCERTAINTY = "PAN px uncertainty (95 %) at the worst corner"
 RADIAL_95 = 1.73
 """Radius that 95 % of errors stay within, over their root mean square: √(ln 20)."""
-SYSTEMATIC_PX = 0.005  # of PAN; unexplained: ablate
+SYSTEMATIC_PX = 0.005  # of PAN; by hand: ½ to 2 × alike
 SIGNIFICANCE = 3.0
 MAX_BANDS_PX = 1.0
 """Between two MS bands: no one correction is right for both to half a PAN pixel."""

@@ -20,7 +20,7 @@ from geodelreg.values.result import BandMap
 _LOCAL_SIGNIFICANCE = 3.0
 _MEDIAN_VARIANCE = 1.57  # π / 2: of a median over that of a mean
 BANDS_TOLD_PX = 0.5  # of PAN: half of what refuses
-_MOSTLY = 0.9  # unexplained: ablate
+_MOSTLY = 0.9  # by hand, untried
 _METRES_PER_KM = 1000.0  # by definition
 _BLOCKS = 4
 _LEAST_PER_BLOCK = 4
