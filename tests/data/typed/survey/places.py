@@ -33,7 +33,7 @@ def place(ms: Path, pan: Path, out: Path, clouds: NDArray[np.bool_] | None = Non
         lines.append(f"{fraction:.0%} {step}")
 
     lines: list[str] = []
-    options = AlignOptions(seed=1)
+    options = AlignOptions(threads=1)
     try:
         alignment = geodelreg.align(
             ms, pan, options, model="scale", mask=clouds, search_radius_px=64.0, progress=told
