@@ -144,7 +144,7 @@ class StoredCorrection:
             raise CorrectionMisfitError(
                 f"{file} was corrected before, by an alignment of the same rasters: once more "
                 "would move it off again",
-                "Apply it to the file as it was (`revert` takes an edit in place back), or add "
+                "Apply it to the file as it was (an edit in place can be taken back), or add "
                 "`force=True`.",
             )
 

@@ -84,12 +84,14 @@ def clouded(tmp_path_factory: pytest.TempPathFactory) -> Clouded:
 def test_clouds_over_two_fifths_do_not_win_without_a_mask(clouded: Clouded) -> None:
     """Their layer is the clearest motion in this scene, 29 px from the ground.
 
-    Without a mask a part that moves by itself may as well be torn ground: it is refused, and told.
+    Without a mask a part that moves by itself may as well be torn ground, and the clouds' place is
+    contradicted by the keypoints of the ground: either is refused, and a mask is asked for.
     """
     with pytest.raises(AlignmentRefusedError, match="`mask`") as caught:
         align(clouded.scene.ms, clouded.scene.pan)
     reasons = caught.value.alignment.verdict.reasons
-    assert [reason.name for reason in reasons if not reason.passed] == ["two_motions"]
+    (failed,) = [reason.name for reason in reasons if not reason.passed]
+    assert failed in ("two_motions", "keypoints_apart")
 
 
 def test_a_mask_of_either_image_lets_the_ground_speak(clouded: Clouded, tmp_path: Path) -> None:
