@@ -159,4 +159,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--count", type=int, default=48, help="pairs of the gate that can be aligned"
     )
-    parser.add_argument("--kinds", type=int, default=24, help="kinds of pairs, one of each")
