@@ -15,6 +15,7 @@ from unittest import mock
 import numpy as np
 from affine import Affine
 
+from benchmarks.gate.attempts import outcome_of
 from benchmarks.gate.bent_cases import FRAMED, BentCase, bent_cases, make_bent
 from benchmarks.gate.cases import NEGATIVE, POSITIVE, TUNING, cases, is_there
 from benchmarks.gate.pairs import make_pair
@@ -121,9 +122,7 @@ def attempt(work: Work, rule: Rule | None = None) -> Row:
         with all rules also those that decided something (``fired``), and the ``candidates``: the
         reasons that failed for each, its error, and where it was looked for.
     """
-    import geodelreg
     from geodelreg import align_pair as method
-    from geodelreg.errors import AlignmentRefusedError, GeodelregError
 
     fired: set[str] = set()
     candidates: list[tuple[list[str], float | None, str]] = []
@@ -145,19 +144,10 @@ def attempt(work: Work, rule: Rule | None = None) -> Row:
         candidates.append((failed, error_px(pair, solution.map), where))
         return solution
 
-    original, started, alignment = method.conclude, process_time(), None
+    original, started = method.conclude, process_time()
     switched = watched(fired) if rule is None else switched_off(rule)
     with switched, mock.patch.object(method, "conclude", conclude):
-        try:
-            alignment = geodelreg.align(work.ms, work.pan, geodelreg.AlignOptions(threads=1))
-            outcome = alignment.verdict.outcome.value
-        except AlignmentRefusedError as error:
-            alignment, outcome = error.alignment, "refused"
-        except GeodelregError as error:
-            outcome = type(error).__name__
-        except Exception as error:
-            log.exception("crashed")
-            outcome = f"crash: {type(error).__name__}: {error}"
+        outcome, alignment = outcome_of(work.ms, work.pan)
     row: Row = {
         "pair": work.name, "alignable": work.alignable, "rule": rule.name if rule else "",
         "outcome": outcome, "cpu_s": process_time() - started,

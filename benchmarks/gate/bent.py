@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
+from benchmarks.gate.attempts import outcome_of
 from benchmarks.gate.bent_cases import BENT, BentCase, BentPair, bent_cases, make_bent
 from benchmarks.records import Row, resume
 from benchmarks.scenes.make import write_scene
@@ -67,27 +68,17 @@ def _rms(pair: BentPair, transform: Affine) -> float:
 
 
 def _aligned(folder: Path, pair: BentPair) -> Row:
-    from geodelreg import align
-    from geodelreg.errors import AlignmentRefusedError, GeodelregError
-    from geodelreg.options import AlignOptions
-
     started = time.perf_counter()
-    try:
-        alignment = align(folder / "ms.tif", folder / "pan.tif", AlignOptions(threads=1))
-    except AlignmentRefusedError as error:
-        reasons = () if error.alignment is None else error.alignment.verdict.reasons
-        failed = [reason.name for reason in reasons if not reason.passed]
-        return {"outcome": "refused", "failed": failed, "seconds": time.perf_counter() - started}
-    except GeodelregError as error:
-        return {"outcome": type(error).__name__, "seconds": time.perf_counter() - started}
-    except Exception as error:
-        log.exception("crashed")
-        return {"outcome": f"crash: {type(error).__name__}: {error}"}
+    outcome, alignment = outcome_of(folder / "ms.tif", folder / "pan.tif")
+    row: Row = {"outcome": outcome, "seconds": time.perf_counter() - started}
+    if outcome == "refused":
+        reasons = () if alignment is None else alignment.verdict.reasons
+        return row | {"failed": [reason.name for reason in reasons if not reason.passed]}
+    if alignment is None:
+        return row
     said = alignment.accuracy
     low, high = getattr(said, "residual_interval_px", (math.nan, math.nan))
-    return {
-        "seconds": time.perf_counter() - started,
-        "outcome": alignment.verdict.outcome.value,
+    return row | {
         "model": alignment.correction.model,
         "warned": list(alignment.warnings),
         "written_px": _rms(pair, alignment.correction.corrected),

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from affine import Affine
 
+from benchmarks.gate.attempts import outcome_of
 from benchmarks.gate.cases import Case, cases, is_there
 from benchmarks.gate.page import false_accept, figure, page
 from benchmarks.gate.pairs import make_pair
@@ -48,21 +49,8 @@ def run_case(case: Case, data: Path) -> Row:
 
 
 def _align(folder: Path, truth: Truth) -> Row:
-    from geodelreg import align
-    from geodelreg.errors import AlignmentRefusedError, GeodelregError
-    from geodelreg.options import AlignOptions
-
-    started, alignment, outcome = time.perf_counter(), None, ""
-    try:
-        alignment = align(folder / "ms.tif", folder / "pan.tif", AlignOptions(threads=1))
-        outcome = alignment.verdict.outcome.value
-    except AlignmentRefusedError as error:
-        alignment, outcome = error.alignment, "refused"
-    except GeodelregError as error:
-        outcome = type(error).__name__
-    except Exception as error:
-        log.exception("crashed")
-        outcome = f"crash: {type(error).__name__}: {error}"
+    started = time.perf_counter()
+    outcome, alignment = outcome_of(folder / "ms.tif", folder / "pan.tif")
     row: Row = {"outcome": outcome, "seconds": time.perf_counter() - started}
     if alignment is None:
         return row | {"evidence": {}}
