@@ -10,7 +10,7 @@ from affine import Affine
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.grid import outline
-from geodelreg.geo.maps.spline import Values, interpolated
+from geodelreg.geo.maps.spline import Values, by_polynomial, interpolated
 from geodelreg.geo.pixel import pixel_centres
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
@@ -18,6 +18,7 @@ from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, G
 
 _WIDEST = 2
 _SPLINE_PX = 0.01  # of the finer raster, whose decimated pixels are wider than one
+_POLYNOMIAL_PX = 1e-3  # of the finer raster: a tenth of what tones and overlays would show
 _ROWS = 128  # at a time: positions of 1000 columns take 2 MB
 
 
@@ -69,8 +70,8 @@ def overlay(part: Roles, template: Band, surface: Surface, correction: PixelMap)
 def placed(part: Roles, template: Band, correction: PixelMap) -> Values:
     """Where pixels of a (decimated) template window lie in the surface raster, outer corner.
 
-    Of a map that is no affine through a spline: a field costs a kernel for each of its points.
-    Where the images jump, through one on either side.
+    Of a map that is no affine through a polynomial, for each point costs PROJ's time, or a spline,
+    for each costs a field a kernel.  Where the images jump, through one on either side.
     """
     there = part.to_surface(correction)
     to_full = ~part.template.grid.transform @ template.grid.transform
@@ -78,8 +79,10 @@ def placed(part: Roles, template: Band, correction: PixelMap) -> Values:
     def asked(y: FloatArray, x: FloatArray) -> FloatArray:
         return there.forward(apply_affine(to_full, np.stack(np.meshgrid(x, y), axis=-1)))
 
-    if correction.as_affine() is not None:
+    if there.as_affine() is not None:
         return asked
+    if correction.as_affine() is not None:
+        return by_polynomial(asked, template.data.shape, _POLYNOMIAL_PX)
     pieces = correction.pieces()
     if len(pieces) == 1 or not part.ms_is_template:
         return interpolated(asked, template.data.shape, _SPLINE_PX)[0]

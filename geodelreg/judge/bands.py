@@ -11,7 +11,7 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.coarse.correlation import best_shift
-from geodelreg.fine.band_offsets import BandPatches
+from geodelreg.fine.band_offsets import BandOffsets, BandPatches
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.matching import BandPass, match_band, match_bands
 from geodelreg.fine.overlay import Overlay
@@ -29,6 +29,7 @@ _BAND_SHARE = 0.5
 _SURE_SIGMAS = 3.0
 _TWO_SIDED_95 = 1.96  # standard errors
 _NEAR_PX = 0.25  # of MS: one step from where the bands lie is right of less, and too long of more
+_ALIKE = 0.5  # of a band's variance, which other bands leave: of less it shows what they show
 _FAR_PX = 0.5  # of the overview: what lies nearer, dense matching has looked at
 
 
@@ -69,46 +70,77 @@ def bands_apart(found: Sequence[BandPass], pair: Pair) -> BandsApart:
     return BandsApart() if furthest is None else furthest.told(pair)
 
 
-def ground_apart(
-    found: Sequence[BandPass], refined: Refinement, correction: PixelMap, told_px: float
-) -> BandsApart:
-    """The same of the ground alone: each band matched on all other bands.
+def ask_bands(
+    guess: Guess, refined: Refinement, correction: PixelMap, told_px: float, pool: Executor
+) -> tuple[BandsApart, BandsApart]:
+    """How far apart bands lie by what they match on PAN, and the ground alone on other bands.
 
-    A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
-    place than its own; among bands, what it shows alone widens its standard error.  All bands must
-    agree unless some were named: one without a weight may have lost it by lying elsewhere.
+    Where one step tells that bands which show the same lie together, PAN is not asked.
 
     Parameters
     ----------
-    found : sequence of BandPass
-        Each of one band alone, few matches or many: where else to look.
+    guess : Guess
+        Its images are searched for bands that lie beyond the reach of dense matching.
     refined : Refinement
     correction : PixelMap
     told_px : float
-        MS pixels: bands that are no further apart are not looked at closely.
+        MS pixels: bands that are surely no further apart are not looked at closely.
+    pool : Executor
+        Each band takes one of its threads.
     """
     part, last = refined.part, refined.last
-    pair = part.pair
     ground = last.matched.template_px[last.status == Status.KEPT]
     patches = BandPatches(part, refined.tiles, ground, correction, refined.size)
-    known = patches.glance()
-    if known is None:
-        return BandsApart()
-    odd = np.hypot(*(known.offset_px - np.median(known.offset_px, axis=0)).T)
-    pairs = list(combinations(sorted(_must_agree(pair), key=lambda band: odd[band]), 2))
-    starts = [np.zeros_like(known.offset_px)]
+    glance = patches.glance()
+    if glance is not None and _lie_together(glance, part.pair, told_px):
+        return BandsApart(), _furthest(glance, part.pair)
+    found = find_bands(guess, refined, correction, pool)
+    told = BandsApart()
+    if glance is not None:
+        told = _ground_apart(patches, glance, found, part.pair, told_px)
+    return bands_apart(found, part.pair), told
+
+
+def _lie_together(glance: BandOffsets, pair: Pair, told_px: float) -> bool:
+    """True of bands that one step, which is right of small offsets only, finds in their place."""
+    return bool(glance.unexplained.max() < _ALIKE and _is_right(glance, pair, told_px))
+
+
+def _is_right(glance: BandOffsets, pair: Pair, told_px: float) -> bool:
+    """True when no gap is longer than what one step tells, nor one that would be told."""
+    widest = max((np.hypot(*glance.gap(*two)[0]) for two in _pairs(glance, pair)), default=0.0)
+    return bool(widest <= _NEAR_PX and _furthest(glance, pair).distance_px <= told_px)
+
+
+def _ground_apart(
+    patches: BandPatches,
+    glance: BandOffsets,
+    found: Sequence[BandPass],
+    pair: Pair,
+    told_px: float,
+) -> BandsApart:
+    """How far apart the bands put the ground alone: each band matched on all other bands.
+
+    A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
+    place than its own; among bands, what it shows alone widens its standard error.
+    """
+    known, starts = glance, [np.zeros_like(glance.offset_px)]
     furthest = next(_gaps(found, pair), None)
     if furthest is not None and furthest.sure_px > told_px:
         starts.append(_by_pan(found, pair))
-    widest = max((float(np.hypot(*known.gap(*two)[0])) for two in pairs), default=0.0)
-    if widest > min(told_px, _NEAR_PX) or len(starts) > 1:
+    if len(starts) > 1 or not _is_right(glance, pair, told_px):
         sought = [offsets for start in starts if (offsets := patches.measure(start)) is not None]
         # a band at a place that is not its own is explained worse
         known = min(
             sought, key=lambda one: float(np.log(one.unexplained + TINY).sum()), default=known
         )
+    return _furthest(known, pair)
+
+
+def _furthest(known: BandOffsets, pair: Pair) -> BandsApart:
+    """The two bands whose ground is furthest apart, beyond its error."""
     best = BandsApart()
-    for one, other in pairs:
+    for one, other in _pairs(known, pair):
         move, sigma_px = known.gap(one, other)
         pull_px = PULL_PX * float(np.sqrt(known.unexplained[one] + known.unexplained[other]))
         sure_px = float(np.hypot(*move)) - _TWO_SIDED_95 * float(np.hypot(sigma_px, pull_px))
@@ -117,8 +149,17 @@ def ground_apart(
     return best
 
 
+def _pairs(known: BandOffsets, pair: Pair) -> list[tuple[int, int]]:
+    """All pairs of the bands that must agree, those that lie most like the others first."""
+    odd = np.hypot(*(known.offset_px - np.median(known.offset_px, axis=0)).T)
+    return list(combinations(sorted(_must_agree(pair), key=lambda band: odd[band]), 2))
+
+
 def _must_agree(pair: Pair) -> list[int]:
-    """The bands that were named, else all, by their place among those read."""
+    """The bands that were named, else all, by their place among those read.
+
+    Those without a weight, too: they may have lost it by lying elsewhere.
+    """
     named = pair.options.agreeing_bands or pair.source_bands
     return [pair.source_bands.index(number) for number in named if number in pair.source_bands]
 

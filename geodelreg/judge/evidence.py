@@ -18,7 +18,7 @@ from geodelreg.fit.choice import Fitted
 from geodelreg.fit.models import points_that_fix
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.judge.accuracy import measure
-from geodelreg.judge.bands import bands_apart, find_bands, ground_apart
+from geodelreg.judge.bands import ask_bands
 from geodelreg.judge.in_place import AreaEvidence, area_evidence
 from geodelreg.judge.repeated import proof_without_repeated
 from geodelreg.judge.rival import Rival, rival_correlation
@@ -68,10 +68,8 @@ def gather(
     with ThreadPoolExecutor(pair.threads) as pool:
         whole, places = pool.submit(overlaid), pool.submit(in_place)
         repeats = pool.submit(proof_without_repeated, refined, correction, enough)
-        bands = find_bands(guess, refined, correction, pool)
-        apart = bands_apart(bands, pair)
         told_px = BANDS_TOLD_PX / pair.pan_px_per_source_px
-        told = ground_apart(bands, refined, correction, told_px)
+        apart, told = ask_bands(guess, refined, correction, told_px, pool)
         (accuracy, rival), area, repeated = whole.result(), places.result(), repeats.result()
     turn_deg, scale = turn_and_scale(pair, correction)
     return accuracy, Evidence(

@@ -1,7 +1,7 @@
-"""Where a map puts the pixels of a grid, through a spline where the map is smooth enough.
+"""Where a map puts the pixels of a grid, through what is quicker where the map is smooth enough.
 
 A field costs a kernel for every point that it stands on, wherever it is asked: a spline through a
-lattice of its values costs nothing.
+lattice of its values costs nothing.  Between two CRSs a polynomial does, which needs no scipy.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from geodelreg.values.raster import FloatArray
 
@@ -16,6 +17,7 @@ MARGIN = 2  # nodes around the grid, where a spline has no end to be unsure of
 COARSEST_PX, FINEST_PX = 64, 2
 """Steps between nodes: from where a field is asked for a few thousand places to where every other
 pixel is, which no spline needs to do better."""
+_DEGREE = 9  # projections are analytic: a scene of a degree of longitude leaves 1e-7 px of it
 
 Values = Callable[[FloatArray, FloatArray], FloatArray]
 """(R, C, 2) places at (R,) rows and (C,) columns of a grid, outer corner."""
@@ -45,6 +47,35 @@ def interpolated(asked: Values, shape: tuple[int, int], tolerance_px: float) -> 
         if np.nanmax(gap) <= tolerance_px:
             return _spline(known, shape, step), step
     return asked, COARSEST_PX
+
+
+def by_polynomial(asked: Values, shape: tuple[int, int], tolerance_px: float) -> Values:
+    """A polynomial of both axes through a few places; the map itself where that does not fit.
+
+    Parameters
+    ----------
+    asked, shape, tolerance_px
+        As for `interpolated`.
+    """
+    height, width = shape
+    nodes, tried = (chebpts1(_DEGREE + n) for n in (1, 2))
+
+    def pixels(places: FloatArray, size: int) -> FloatArray:
+        return np.asarray((places + 1) * size / 2)
+
+    known = asked(pixels(nodes, height), pixels(nodes, width))
+    through = np.linalg.inv(chebvander(nodes, _DEGREE))
+    terms = np.einsum("ij,jkc,lk->ilc", through, known, through)
+
+    def values(y: FloatArray, x: FloatArray) -> FloatArray:
+        down, across = (
+            chebvander(2 * at / size - 1, _DEGREE) for at, size in ((y, height), (x, width))
+        )
+        return np.stack([down @ terms[:, :, axis] @ across.T for axis in (0, 1)], axis=-1)
+
+    places = pixels(tried, height), pixels(tried, width)
+    gap = np.abs(values(*places) - asked(*places))
+    return values if np.isfinite(gap).all() and gap.max() <= tolerance_px else asked
 
 
 def axes(shape: tuple[int, int], step: int) -> tuple[FloatArray, FloatArray]:
