@@ -228,13 +228,14 @@ def _of_the_ground(
     everything = _passes(part, tiles, near, size, (PLAIN, *SHARPER))
     if guess.bright is None:
         return everything
-    if everything is not None and (kernel := _calm_bend(everything)) is not None:
-        return replace(everything, bend=kernel)
-    unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
-    if everything is not None and (
-        everything.is_blurred or everything.last.is_calm or nothing_moves(everything.last, unit)
-    ):
-        return everything
+    if everything is not None:
+        if everything.is_blurred or everything.last.is_calm:
+            return everything
+        if (kernel := _calm_bend(everything)) is not None:
+            return replace(everything, bend=kernel)
+        unit = part.step if part.ms_is_template else part.surface_px_per_patch_px
+        if nothing_moves(everything.last, unit):
+            return everything
     hidden = [dark_tile(part, tile, guess) for tile in tiles]
     from_header = _is_near_header(part, near)
     ground = _passes(part, hidden, near, _size_for(hidden, size), (HAZE, PLAIN), from_header)
