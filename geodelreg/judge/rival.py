@@ -20,6 +20,8 @@ _RIVALS = 5  # by hand: ½ to 2 × alike
 _RIVAL_OVERLAP = 0.2  # by hand: ½ to 2 × alike
 _BLOCK_PX = 32  # of the image magnified twice
 _UNSUSPICIOUS = 0.5
+_EVEN = 0.2  # of images lit alike 0.17 at most
+_FIELD_PX = 12  # of ten changed pairs six are then below 0.3, of 16 and 24 five; relief is alike
 
 
 class Rival(NamedTuple):
@@ -34,7 +36,8 @@ class Rival(NamedTuple):
         Best correlation of opposite contrast within a few pixels, on one side of the place only.
         Where light falls differently, slopes are bright in one image as they face it, and flat
         ground is in the other as it is: correlation changes its sign across the true place, which
-        is beside the one found.  Of images lit alike it is even around the place.
+        is beside the one found.  Of images lit alike it is even around the place.  Opposite to the
+        contrast of the field at the place: fields that have changed are opposite as a whole.
     """
 
     elsewhere: float
@@ -65,14 +68,17 @@ def rival_correlation(overlay: Overlay) -> Rival:
     scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
     reach = 1
-    here = scores[middle_y - reach : middle_y + reach + 1, middle_x - reach : middle_x + reach + 1]
-    in_place = float(here.max())
+    in_place = float(scores[around(middle_y, reach), around(middle_x, reach)].max())
     if in_place <= 0:
         return Rival(float("inf"), float("inf"))
-    near = np.s_[
-        middle_y - _NEAR_PX : middle_y + _NEAR_PX + 1, middle_x - _NEAR_PX : middle_x + _NEAR_PX + 1
-    ]
+    near = around(middle_y, _NEAR_PX), around(middle_x, _NEAR_PX)
     beside = float(_one_sided(signed[near]).max()) / in_place
+    if beside > _EVEN:
+        alike, _ = masked_correlation(
+            _turned(one, other), one_mask, other, other_mask, _RIVAL_OVERLAP * common
+        )
+        highest = float(np.abs(alike[around(middle_y, reach), around(middle_x, reach)]).max())
+        beside = min(beside, float(_one_sided(alike[near]).max()) / highest)
     scores[near] = 0.0
     rivals: list[float] = []
     by_block: Callable[[int, int], float] | None = None
@@ -100,6 +106,16 @@ def _one_sided(signed: Float32Array) -> Float32Array:
     opposite = np.maximum(-signed * np.sign(around[row, column]), 0.0)
     mirrored = np.roll(opposite[::-1, ::-1], (2 * (row - 1), 2 * (column - 1)), axis=(0, 1))
     return np.asarray(np.maximum(opposite - mirrored, 0.0), dtype=np.float32)
+
+
+def _turned(one: Float32Array, other: Float32Array) -> Float32Array:
+    """The first image, its contrast that of the other in every field."""
+    (height, width), side = one.shape, _FIELD_PX
+    by_rows = np.add.reduceat(one * other, np.arange(0, height, side), axis=0)
+    together = np.add.reduceat(by_rows, np.arange(0, width, side), axis=1)
+    opposite = np.where(together < 0, np.float32(-1), np.float32(1))
+    spread = opposite.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
+    return np.asarray(one * spread, dtype=np.float32)
 
 
 def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int], float]:

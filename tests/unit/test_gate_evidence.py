@@ -36,6 +36,7 @@ from geodelreg.values.raster import Band, Grid, Window
 SIDE = 140
 # limits of the gate, as docs/method.md tells them
 MAX_RIVAL, MAX_RIVAL_MOTION, MAX_BANDS_APART, MAX_KEYPOINTS_APART = 0.85, 0.67, 0.5, 2.0
+MAX_SHADING = 0.3
 GRID = Grid(
     Affine(4.0, 0, 500_000, 0, -4.0, 4_000_000), (SIDE, SIDE), CRS.from_epsg(32618).to_wkt()
 )
@@ -137,7 +138,19 @@ def test_fields_of_inverted_contrast_are_no_rival() -> None:
     rows, columns = np.mgrid[:SIDE, :SIDE] // 28
     sign = np.where((rows + columns) % 2 == 0, 1.0, -1.0).astype(np.float32)
     assert abs(np.corrcoef(field.ravel(), (field * sign).ravel())[0, 1]) < 0.1
-    assert rival_correlation(overlaid(field, field * sign)).elsewhere < MAX_RIVAL
+    found = rival_correlation(overlaid(field, field * sign))
+    assert found.elsewhere < MAX_RIVAL
+    assert found.beside < MAX_SHADING
+
+
+def test_slopes_in_fields_that_changed_are_still_beside() -> None:
+    """Light from one side shows each edge bright beside dark, whatever the field was."""
+    field = texture(5)
+    rows, columns = np.mgrid[:SIDE, :SIDE] // 28
+    sign = np.where((rows + columns) % 2 == 0, 1.0, -1.0).astype(np.float32)
+    slopes = np.gradient(ndimage.gaussian_filter(field * sign, 1.0), axis=1).astype(np.float32)
+    lit = ndimage.shift(slopes, (0, 2.0), order=1, mode="nearest")
+    assert rival_correlation(overlaid(field, lit)).beside > MAX_SHADING
 
 
 def test_unseen_displaced_places_do_not_silence_a_patch() -> None:
