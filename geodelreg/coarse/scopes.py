@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.pair import Pair
 from geodelreg.values.points import Overview, Scope
@@ -25,7 +24,7 @@ def scopes(pair: Pair) -> Iterator[Scope]:
     source, reference = pair.source.grid, pair.reference.grid
     most = pair.options.max_keypoints
     few = max(min(most, _FIRST_KEYPOINTS), most // 4)
-    windows = overlap_windows(source, reference, pair.options.search_radius_px, map_points)
+    windows = overlap_windows(source, reference, pair.options.search_radius_px)
     whole = tuple(Window(0, 0, grid.shape[1], grid.shape[0]) for grid in (source, reference))
     if windows is not None:
         first = Scope(*windows, _FIRST_BUDGET_PX, few, "header overlap")

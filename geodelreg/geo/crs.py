@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geodelreg.errors import CrsTransformError
-from geodelreg.values.raster import FloatArray
+from geodelreg.geo.affine import apply_affine
+from geodelreg.values.raster import FloatArray, Grid
 
 if TYPE_CHECKING:
     from pyproj import Transformer
@@ -130,3 +131,9 @@ def map_points(xy: FloatArray, from_wkt: str, to_wkt: str) -> FloatArray:
     out = np.stack([x, y], axis=-1).reshape(points.shape)
     out[~np.isfinite(out)] = np.nan
     return out
+
+
+def map_pixels(px: FloatArray, start: Grid, end: Grid) -> FloatArray:
+    """(..., 2) pixels of one raster to (..., 2) pixels of another; NaN where undefined."""
+    ground = map_points(apply_affine(start.transform, px), start.crs_wkt, end.crs_wkt)
+    return apply_affine(~end.transform, ground)

@@ -8,7 +8,6 @@ import numpy as np
 
 from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
 from geodelreg.fit.choice import spatial_blocks
-from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
@@ -104,7 +103,7 @@ def first_of_many(pair: Pair) -> str:
 def _doubts_of_place(pair: Pair, points: TiePoints) -> Iterator[str]:
     """Whether the headers are of the same world."""
     source, reference, kept = pair.source, pair.reference, points.kept
-    if kept.any() and overlap_windows(source.grid, reference.grid, 0.0, map_points) is None:
+    if kept.any() and overlap_windows(source.grid, reference.grid, 0.0) is None:
         moves = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
         far_km = float(np.median(np.hypot(*(moves * pair.reference_gsd_m).T))) / _METRES_PER_KM
         yield (

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.geo.grid import decimated_grid, gsd_px_m
 from geodelreg.raster.decimate import BoxAverage
@@ -128,7 +127,7 @@ def test_overlap_windows_cover_all_shared_points(
     mapped = (~reference.transform @ source.transform) @ (columns, rows)
     near = (mapped[0] >= -grow_px) & (mapped[0] <= reference.shape[1] + grow_px)
     near &= (mapped[1] >= -grow_px) & (mapped[1] <= reference.shape[0] + grow_px)
-    result = overlap_windows(source, reference, grow_px, map_points)
+    result = overlap_windows(source, reference, grow_px)
     if result is None:
         strict = near & (np.abs(columns / source.shape[1] - 0.5) < 0.49)
         assert not (strict & (np.abs(rows / source.shape[0] - 0.5) < 0.49)).any()

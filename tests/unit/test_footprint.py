@@ -7,7 +7,6 @@ import pytest
 from affine import Affine
 from pyproj import CRS, Transformer
 
-from geodelreg.geo.crs import map_points
 from geodelreg.geo.footprint import footprint_in, overlap_windows
 from geodelreg.values.raster import Grid, Window
 
@@ -58,7 +57,7 @@ PAIRS = {
 @pytest.mark.parametrize("grow_px", [0.0, 40.0])
 def test_windows_cover_the_overlap(name: str, grow_px: float) -> None:
     source, reference = PAIRS[name]
-    windows = overlap_windows(source, reference, grow_px, map_points)
+    windows = overlap_windows(source, reference, grow_px)
     assert windows is not None
     in_source, in_reference = shared_pixels(source, reference)
     if name != "the world within":  # its 90 × 90 points miss the small raster
@@ -75,7 +74,7 @@ def test_windows_cover_the_overlap(name: str, grow_px: float) -> None:
 @pytest.mark.parametrize("name", ["same CRS", "south-up", "geographic", "neighbouring zone"])
 def test_windows_are_tight(name: str) -> None:
     source, reference = PAIRS[name]
-    windows = overlap_windows(source, reference, 0.0, map_points)
+    windows = overlap_windows(source, reference, 0.0)
     assert windows is not None
     for points, window in zip(shared_pixels(source, reference), windows, strict=True):
         seen = np.ptp(points, axis=0)
@@ -84,9 +83,9 @@ def test_windows_are_tight(name: str) -> None:
 
 def test_growing_reaches_as_far_as_the_header_may_be_wrong() -> None:
     source = grid(Affine(15, 0, 5e5 + 1230 * 15, 0, -15, 14e5), (1000, 1200), 32616)
-    assert overlap_windows(source, PAN, 0.0, map_points) is None
-    assert overlap_windows(source, PAN, 25.0, map_points) is None
-    windows = overlap_windows(source, PAN, 100.0, map_points)
+    assert overlap_windows(source, PAN, 0.0) is None
+    assert overlap_windows(source, PAN, 25.0) is None
+    windows = overlap_windows(source, PAN, 100.0)
     assert windows is not None
     in_source, in_reference = windows
     # the source starts 30 px right of the reference's last column
@@ -107,32 +106,32 @@ def test_growing_reaches_as_far_as_the_header_may_be_wrong() -> None:
     ids=["same zone", "other side of the earth", "geographic", "touching"],
 )
 def test_disjoint_rasters_share_nothing(source: Grid) -> None:
-    assert overlap_windows(source, PAN, 0.0, map_points) is None
+    assert overlap_windows(source, PAN, 0.0) is None
 
 
 def test_footprint_of_a_raster_in_itself_is_its_frame() -> None:
-    footprint = footprint_in(PAN, PAN, map_points)
+    footprint = footprint_in(PAN, PAN)
     assert footprint is not None
     assert footprint.bounds == pytest.approx((0, 0, 1200, 1000))
     assert footprint.area == pytest.approx(1200 * 1000)
 
 
 def test_footprint_that_cannot_be_followed_is_none() -> None:
-    assert footprint_in(WORLD, PAN, map_points) is None
-    assert footprint_in(PAIRS["antimeridian"][0], WORLD, map_points) is None
+    assert footprint_in(WORLD, PAN) is None
+    assert footprint_in(PAIRS["antimeridian"][0], WORLD) is None
 
 
 def test_footprint_torn_at_the_antimeridian_is_no_frame_around_the_rest() -> None:
     # straight edges in both CRSs: the torn outline is a valid polygon, 358 degrees wide
     mercator_150_east = grid(Affine(1000, 0, 3_228_000, 0, -1000, 4e5), (300, 222), 3832)
-    assert footprint_in(mercator_150_east, WORLD, map_points) is None
+    assert footprint_in(mercator_150_east, WORLD) is None
 
 
 def test_grown_rasters_that_touch_at_a_corner_only_overlap() -> None:
     """Further apart than the search radius along the diagonal, but not along either axis."""
     reference = grid(Affine(10, 0, 500_000, 0, -10, 1_400_000), (50, 50), 32616)
     source = grid(Affine(10, 0, 500_640, 0, -10, 1_399_360), (50, 50), 32616)
-    windows = overlap_windows(source, reference, 17.0, map_points)
+    windows = overlap_windows(source, reference, 17.0)
     assert windows is not None
     assert windows[0].column == 0
     assert windows[1].column + windows[1].width == 50

@@ -8,8 +8,7 @@ from typing import Any
 
 from affine import Affine
 
-from geodelreg.geo.affine import apply_affine
-from geodelreg.geo.crs import CrsOperation, crs_operation, map_points, same_crs
+from geodelreg.geo.crs import CrsOperation, crs_operation, map_pixels, same_crs
 from geodelreg.geo.maps.smooth import SmoothMap
 from geodelreg.values.raster import FloatArray, Grid
 
@@ -32,11 +31,11 @@ class HeaderMap(SmoothMap):
 
     def forward(self, xy: FloatArray) -> FloatArray:
         """(..., 2) source pixels to (..., 2) reference pixels; NaN where undefined."""
-        return _through(xy, self.source, self.reference)
+        return map_pixels(xy, self.source, self.reference)
 
     def inverse(self, xy: FloatArray) -> FloatArray:
         """(..., 2) reference pixels to (..., 2) source pixels; NaN where undefined."""
-        return _through(xy, self.reference, self.source)
+        return map_pixels(xy, self.reference, self.source)
 
     def to_json(self) -> dict[str, Any]:
         """Both geotransforms, in GDAL's order, with their CRSs."""
@@ -52,11 +51,6 @@ class HeaderMap(SmoothMap):
             return None
         affine: Affine = ~self.reference.transform @ self.source.transform
         return affine
-
-
-def _through(px: FloatArray, start: Grid, end: Grid) -> FloatArray:
-    ground = map_points(apply_affine(start.transform, px), start.crs_wkt, end.crs_wkt)
-    return apply_affine(~end.transform, ground)
 
 
 def header_map(source: Grid, reference: Grid) -> HeaderMap:
