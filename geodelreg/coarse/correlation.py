@@ -6,6 +6,7 @@ doi:10.1109/TIP.2011.2181402).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -83,6 +84,15 @@ def _vertex(scores: Float32Array, best: int) -> float:
 def around(centre: int, reach: int) -> slice:
     """Rows or columns no further off than `reach`."""
     return slice(max(centre - reach, 0), centre + reach + 1)
+
+
+def common_parts(
+    shape: tuple[int, ...], step: Sequence[int]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Pixels of an image, and those of another (rows, columns) further, that both have."""
+    sides = list(zip(shape, step, strict=True))
+    mine = tuple(slice(max(-by, 0), min(side - by, side)) for side, by in sides)
+    return mine, tuple(slice(max(by, 0), min(side + by, side)) for side, by in sides)
 
 
 def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:

@@ -41,8 +41,6 @@ class KeypointOptions:
         Threshold below which keypoints are never used.
     per_cell : int
         Mean number of keypoints per cell of the grid they are spread over.
-    invalid_margin : float
-        Keypoints closer to an invalid pixel than this many of their own diameters are dropped.
     root : bool
         Square root of the L1-normalised descriptor (RootSIFT: Arandjelović & Zisserman 2012,
         doi:10.1109/CVPR.2012.6248018) instead of the plain one: fewer wrong matches between dates.
@@ -54,7 +52,6 @@ class KeypointOptions:
     contrast: float = 0.04
     low_contrast: float = 0.01
     per_cell: int = 8
-    invalid_margin: float = 1.0
     root: bool = True
     whole_px: int = 600_000
 
@@ -64,7 +61,8 @@ def detect(
 ) -> Keypoints:
     """Detect and describe SIFT keypoints (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94).
 
-    The result does not depend on OpenCV's thread count.  Keypoints are ordered from the strongest
+    The result does not depend on OpenCV's thread count.  Keypoints closer to an invalid pixel than
+    their own diameter are dropped.  The others are ordered from the strongest
     of each cell of a grid to weaker ones, so any leading part of them is spread over the image.
 
     Parameters
@@ -88,17 +86,16 @@ def detect(
         contrastThreshold=min(options.contrast, options.low_contrast),
         enable_precise_upscale=True,
     )
-    tiles = _tiles(image.shape, options.whole_px)
-    found = [_detect_in_tile(sift, image, tile) for tile in tiles]
-    table = np.concatenate(
-        [_table(points) + tile.offset for tile, points in zip(tiles, found, strict=True)]
-    )
-    if not len(table):
-        return no_keypoints()
-    candidates = np.flatnonzero(_away_from_invalid(table, valid, options.invalid_margin))
+    found = [(tile, _detect_in_tile(sift, image, tile)) for tile in _tiles(image, options.whole_px)]
+    table = np.concatenate([_table(points) + tile.offset for tile, points in found])
+    candidates = np.flatnonzero(_away_from_invalid(table, valid))
     chosen = candidates[_spread_order(table[candidates], image.shape, options)]
     logger.debug("%d keypoints found, %d kept", len(table), len(chosen))
-    return _describe(sift, image, list(zip(tiles, found, strict=True)), chosen, options.root)
+    if not len(chosen):
+        return no_keypoints()
+    descriptors = _describe(sift, image, found, chosen)
+    xy = centre_to_corner(np.ascontiguousarray(table[chosen, :2]))
+    return Keypoints(xy, _root(descriptors) if options.root else descriptors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +111,9 @@ class _Tile:
         return np.array([self.around[1].start, self.around[0].start, 0, 0, 0], dtype=np.float64)
 
 
-def _tiles(shape: tuple[int, ...], whole_px: int) -> list[_Tile]:
+def _tiles(image: NDArray[np.uint8], whole_px: int) -> list[_Tile]:
     """Parts of a large image."""
+    shape = image.shape
     if shape[0] * shape[1] <= whole_px:
         whole = (slice(0, shape[0]), slice(0, shape[1]))
         return [_Tile(whole, whole)]
@@ -163,23 +161,16 @@ def _table(found: Sequence[cv2.KeyPoint]) -> FloatArray:
 
 def no_keypoints() -> Keypoints:
     """Of an image without any."""
-    empty = np.empty(0, dtype=np.float64)
-    return Keypoints(
-        np.empty((0, 2), dtype=np.float64),
-        empty,
-        empty,
-        empty,
-        np.empty((0, DESCRIPTOR_LENGTH), dtype=np.float32),
-    )
+    return Keypoints(np.empty((0, 2)), np.empty((0, DESCRIPTOR_LENGTH), dtype=np.float32))
 
 
-def _away_from_invalid(table: FloatArray, valid: BoolArray, margin: float) -> BoolArray:
+def _away_from_invalid(table: FloatArray, valid: BoolArray) -> BoolArray:
     if valid.all():
         return np.ones(len(table), dtype=np.bool_)
     distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, _MASK_SIZE)
     column = np.clip(np.rint(table[:, 0]).astype(np.intp), 0, valid.shape[1] - 1)
     row = np.clip(np.rint(table[:, 1]).astype(np.intp), 0, valid.shape[0] - 1)
-    return np.asarray(distance[row, column] > margin * table[:, 2] + 1.0)
+    return np.asarray(distance[row, column] > table[:, 2] + 1.0)
 
 
 def _spread_order(table: FloatArray, shape: tuple[int, int], options: KeypointOptions) -> IntArray:
@@ -205,29 +196,17 @@ def _describe(
     image: NDArray[np.uint8],
     found: Sequence[tuple[_Tile, list[cv2.KeyPoint]]],
     chosen: IntArray,
-    root: bool,
-) -> Keypoints:
-    """Describe the chosen ones, numbered through all tiles, in their order."""
-    if not len(chosen):
-        return no_keypoints()
-    table = np.empty((len(chosen), _FIELDS))
+) -> Float32Array:
+    """(N, 128) descriptors of the chosen ones, numbered through all tiles, in their order."""
     descriptors = np.empty((len(chosen), DESCRIPTOR_LENGTH), dtype=np.float32)
     first = 0
     for tile, points in found:
         mine = np.flatnonzero((chosen >= first) & (chosen < first + len(points)))
         if len(mine):
             kept = [points[number - first] for number in chosen[mine]]
-            part = np.ascontiguousarray(image[tile.around])
-            described, descriptors[mine] = sift.compute(part, kept)
-            table[mine] = _table(described) + tile.offset
+            _, descriptors[mine] = sift.compute(np.ascontiguousarray(image[tile.around]), kept)
         first += len(points)
-    return Keypoints(
-        centre_to_corner(np.ascontiguousarray(table[:, :2])),
-        table[:, 2].copy(),
-        table[:, 3].copy(),
-        table[:, 4].copy(),
-        _root(descriptors) if root else descriptors,
-    )
+    return descriptors
 
 
 def _root(descriptors: Float32Array) -> Float32Array:

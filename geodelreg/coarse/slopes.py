@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from geodelreg.coarse.correlation import detail_pair, masked_correlation
+from geodelreg.coarse.correlation import common_parts, detail_pair, masked_correlation
 from geodelreg.coarse.scopes import overview_shapes, scopes
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.overlay import overlay
 from geodelreg.fine.surface import make_surface
-from geodelreg.geo.grid import decimated_grid
+from geodelreg.geo.grid import corners_of, decimated_grid, window_around
 from geodelreg.geo.maps.affine import IDENTITY
 from geodelreg.pair import Pair, roles
 from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window, WindowReader
@@ -114,7 +114,9 @@ class Slopes:
             inner = tuple(min(max(s, m), n) for s, m, n in zip(shape, most, least, strict=True))
             read = self.reader.read(bands, window, (inner[0], inner[1]))
             return [self._slope(band) for band in read]
-        wide = _grown(window, math.ceil(_REACH * self.unit_px) + 1, self.grid.shape)
+        margin = math.ceil(_REACH * self.unit_px) + 1
+        wide = window_around(corners_of(window), margin, self.grid)
+        assert wide is not None
         top, left = window.row - wide.row, window.column - wide.column
         inside = np.s_[top : top + window.height, left : left + window.width]
         grid = decimated_grid(self.grid, window, None)
@@ -139,14 +141,6 @@ class Slopes:
             for axis in ((1, 0), (0, 1))
         )
         return _Slope(band, across, down, np.asarray(valid))
-
-
-def _grown(window: Window, margin: int, shape: tuple[int, int]) -> Window:
-    """The window with a margin, within a raster."""
-    left, top = max(window.column - margin, 0), max(window.row - margin, 0)
-    right = min(window.column + window.width + margin, shape[1])
-    bottom = min(window.row + window.height + margin, shape[0])
-    return Window(left, top, right - left, bottom - top)
 
 
 def _averaged(band: Band, shape: tuple[int, int]) -> Band:
@@ -231,13 +225,10 @@ class _Beside:
         place : (int, int)
             In `likeness`.
         """
-        down, across = (
-            side - 1 - int(i) for side, i in zip(self.coarser.shape, place, strict=True)
-        )
+        step = [side - 1 - int(i) for side, i in zip(self.coarser.shape, place, strict=True)]
+        mine, other = common_parts(self.coarser.shape, step)
         first = np.gradient(slopes)
         second = [*np.gradient(first[0]), np.gradient(first[1])[1]]
-        here, there = _common(down), _common(across)
-        mine, other = (here[0], there[0]), (here[1], there[1])
         good = (self.coarser_mask[mine] * self.finer_mask[other]) > 0
         looks = [slopes, *first, *second, self.finer]
         columns = np.stack([look[other][good] for look in looks], axis=1).astype(np.float64)
@@ -249,10 +240,3 @@ class _Beside:
             for some in (columns[:, :-1], columns)
         ]
         return left[1] < (1 - _BOTH) * left[0]
-
-
-def _common(step: int) -> tuple[slice, slice]:
-    """Along one axis, where a pixel of the one image and that `step` further of the other are."""
-    return slice(max(-step, 0), -step if step > 0 else None), slice(
-        max(step, 0), step if step < 0 else None
-    )

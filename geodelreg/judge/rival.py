@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from geodelreg.coarse.correlation import around, detail_pair, masked_correlation
+from geodelreg.coarse.correlation import around, common_parts, detail_pair, masked_correlation
 from geodelreg.fine.overlay import Overlay
 from geodelreg.values.raster import Float32Array, FloatArray
 
@@ -67,8 +67,7 @@ def rival_correlation(overlay: Overlay) -> Rival:
     signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
     scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
-    reach = 1
-    in_place = float(scores[around(middle_y, reach), around(middle_x, reach)].max())
+    in_place = float(scores[around(middle_y, 1), around(middle_x, 1)].max())
     if in_place <= 0:
         return Rival(float("inf"), float("inf"))
     near = around(middle_y, _NEAR_PX), around(middle_x, _NEAR_PX)
@@ -77,7 +76,7 @@ def rival_correlation(overlay: Overlay) -> Rival:
         alike, _ = masked_correlation(
             _turned(one, other), one_mask, other, other_mask, _RIVAL_OVERLAP * common
         )
-        highest = float(np.abs(alike[around(middle_y, reach), around(middle_x, reach)]).max())
+        highest = float(np.abs(alike[around(middle_y, 1), around(middle_x, 1)]).max())
         beside = min(beside, float(_one_sided(alike[near]).max()) / highest)
     scores[near] = 0.0
     rivals: list[float] = []
@@ -101,9 +100,9 @@ def _one_sided(signed: Float32Array) -> Float32Array:
     Of images that are alike it is even: side lobes come in pairs.
     """
     middle = signed.shape[0] // 2
-    around = signed[middle - 1 : middle + 2, middle - 1 : middle + 2]
-    row, column = np.unravel_index(int(np.abs(around).argmax()), around.shape)
-    opposite = np.maximum(-signed * np.sign(around[row, column]), 0.0)
+    here = signed[around(middle, 1), around(middle, 1)]
+    row, column = np.unravel_index(int(np.abs(here).argmax()), here.shape)
+    opposite = np.maximum(-signed * np.sign(here[row, column]), 0.0)
     mirrored = np.roll(opposite[::-1, ::-1], (2 * (row - 1), 2 * (column - 1)), axis=(0, 1))
     return np.asarray(np.maximum(opposite - mirrored, 0.0), dtype=np.float32)
 
@@ -126,10 +125,10 @@ def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int]
     """
     finer = [cv2.resize(i, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC) for i in (one, other)]
     first, second = (np.asarray(image, np.float32) for image in finer)
-    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
+    nearby = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
 
     def best(dy: int, dx: int) -> float:
-        return max(_block_correlation(first, second, (2 * dy + y, 2 * dx + x)) for y, x in around)
+        return max(_block_correlation(first, second, (2 * dy + y, 2 * dx + x)) for y, x in nearby)
 
     here = best(0, 0)
     return lambda dy, dx: best(dy, dx) / here if here > 0 else float("nan")
@@ -137,11 +136,8 @@ def _rival_blocks(one: Float32Array, other: Float32Array) -> Callable[[int, int]
 
 def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int, int]) -> float:
     """Root mean square correlation of blocks of `one` with `other` at (rows, columns) further."""
-    height, width = one.shape
-    dy, dx = moved
-    first = one[max(-dy, 0) : min(height - dy, height), max(-dx, 0) : min(width - dx, width)]
-    second = other[max(dy, 0) : min(height + dy, height), max(dx, 0) : min(width + dx, width)]
-    a, b = _blocks(first), _blocks(second)
+    mine, theirs = common_parts(one.shape, moved)
+    a, b = _blocks(one[mine]), _blocks(other[theirs])
     power = (a**2).sum(axis=1) * (b**2).sum(axis=1)
     textured = power > _LEAST_POWER
     if not textured.any():

@@ -28,15 +28,10 @@ class Keypoints:
     ----------
     xy : (N, 2) float64
         Outer-corner pixel coordinates.
-    scale_px, angle_deg, response : (N,) float64
-        Diameter of the neighbourhood, orientation (clockwise), strength.
     descriptors : (N, 128) float32
     """
 
     xy: FloatArray
-    scale_px: FloatArray
-    angle_deg: FloatArray
-    response: FloatArray
     descriptors: Float32Array
 
     def __len__(self) -> int:

@@ -17,8 +17,7 @@ from geodelreg.values.points import Keypoints
 def keypoints(count: int, seed: int) -> Keypoints:
     rng = np.random.default_rng(seed)
     descriptors = rng.integers(0, 120, (count, 128)).astype(np.float32)
-    ones = np.ones(count)
-    return Keypoints(rng.uniform(0, 100, (count, 2)), ones, ones, ones, descriptors)
+    return Keypoints(rng.uniform(0, 100, (count, 2)), descriptors)
 
 
 @pytest.mark.parametrize(("sources", "references"), [(1, 2), (300, 257), (2500, 40)])
