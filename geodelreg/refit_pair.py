@@ -11,7 +11,7 @@ import numpy as np
 
 from geodelreg.errors import PointsError
 from geodelreg.fine.snap import snap_points
-from geodelreg.fit.choice import Selection, select_again, select_for
+from geodelreg.fit.choice import Selection, select_for, select_one
 from geodelreg.fit.estimate import Observations, minimum_points, student_weight
 from geodelreg.fit.field import (
     FEWEST_POINTS,
@@ -204,7 +204,7 @@ def _fit(
     model = form.model if form else pair.options.model
     weight = given.weight[used]
     selection = (
-        select_again(model, points, Frame.of(pair), form.spread_px2, weight)
+        select_one(model, points, Frame.of(pair), form.spread_px2, weight)
         if form and model not in FOLLOWING
         else select_for(pair, points)
     )

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geodelreg.fit.chance import log10_binomial_tail
 from geodelreg.fit.estimate import Observations
+from geodelreg.fit.field import MOST_STRAIN
+from geodelreg.geo.triangulation import edges, relative_altitude
 from geodelreg.values.maps import PixelMap
-from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
-MOST_STRAIN = 0.04
-"""Of a map that is still the ground: steeper ones would fold relief or jitter into itself."""
 LEAST_SHARE = 0.05  # by hand: ½ to 2 × alike
 LEAST_PATCHES = 4
 """That agree on another motion: less than one pair in a thousand has so many by chance, and a
@@ -98,13 +99,7 @@ def neighbours(xy: FloatArray) -> IntArray:
         triangle = Delaunay(xy, qhull_options="QJ Pp").simplices
     except QhullError:
         return np.empty((0, 2), dtype=np.intp)
-    corner = xy[triangle]
-    side = corner - np.roll(corner, 1, axis=1)
-    longest2 = (side**2).sum(axis=2).max(axis=1)
-    twice_area = np.abs(side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0])
-    triangle = triangle[twice_area > _SLIVER * longest2]
-    both = np.sort(np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]]))
-    return np.asarray(np.unique(both, axis=0), dtype=np.intp)
+    return edges(triangle[relative_altitude(xy, triangle) > _SLIVER].astype(np.intp))
 
 
 def _smooth(xy: FloatArray, move: FloatArray, sigma_px: FloatArray, pairs: IntArray) -> BoolArray:
@@ -155,8 +150,6 @@ def second_motion(
     -------
     Motion or None
     """
-    from scipy.special import bdtrc
-
     index = np.flatnonzero(candidate)
     if len(index) < 2:
         return None
@@ -168,8 +161,7 @@ def second_motion(
     count, total = int(inside.sum()), len(index)
     share = min((radius_px / reach_px) ** 2, 1.0)
     # one of the members gave the place, so one less speaks for it
-    tail = float(bdtrc(count - 2, total - 1, share)) if count > 1 else 1.0
-    log_nfa = math.log10(total) + math.log10(max(tail, TINY))
+    log_nfa = math.log10(total) + log10_binomial_tail(count - 1, total - 1, share)
     if log_nfa > math.log10(_CHANCE):
         return None
     member = np.zeros(len(move), dtype=bool)

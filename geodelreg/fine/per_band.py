@@ -22,6 +22,7 @@ from geodelreg.fine.surface import make_surface, sample
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tone import single_band
 from geodelreg.fine.tuning import lattice, places, tile_images
+from geodelreg.fit.models import Frame, generators
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, FloatArray
@@ -38,12 +39,6 @@ _EDGE_PX = 4  # of a tile, where gradients and displaced bands see what lies out
 _FEWEST_PIXELS = 64  # of a patch: more than there are unknowns
 _MOST_SIGMA_PX = 0.1  # of MS: a band of which less is known is not said to lie anywhere
 _REACH_PX = 4.0  # of MS: twice the first blur
-_LINEAR = {
-    "scale": ((1, 0, 0, 0), (0, 0, 0, 1)),
-    "similarity": ((1, 0, 0, 1), (0, 1, -1, 0)),
-    "affine": ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
-}
-"""What may still change of the common map, as (dx/du, dx/dv, dy/du, dy/dv); else nothing."""
 _System = tuple[FloatArray, FloatArray, float, int]
 """Normal matrix and right side of a part, its sum of squares, and its pixels."""
 
@@ -79,7 +74,7 @@ def match_each_band(
     tuple of BandMap
         Of each band that is matched on and that shows enough.
     """
-    fit = _Fit(refined, common, _LINEAR.get(common_model, ()) if model == "shift" else (), model)
+    fit = _Fit(refined, common, common_model, model)
     for blur in _BLURS_PX:
         fit.step(blur, against=())
     sure = [band for band in fit.bands if fit.is_sure(band)]
@@ -96,11 +91,13 @@ class _Fit:
     """
 
     def __init__(
-        self, refined: Refinement, common: PixelMap, linear: Sequence[Sequence[int]], model: str
+        self, refined: Refinement, common: PixelMap, common_model: str, model: str
     ) -> None:
         self.refined, self.common = refined, common
         self.bands = range(len(refined.part.pair.source_bands))
-        self.linear = np.array(linear, dtype=np.float64).reshape(-1, 2, 2)
+        # what may still change of the common map
+        free = common_model if model == "shift" else "shift"
+        self.linear = generators(free, Frame.of(refined.part.pair))
         self.terms = 1 if model == "shift" else 3
         height, width = refined.part.pair.source.grid.shape
         self.centre, self.span = np.array([width, height]) / 2, max(width, height) / 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,22 +33,6 @@ _LEAST_PREDICTED = 0.5
 _DOUBT_SIGMAS = 2.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
-    """Errors at points that the predicting fit has not seen.
-
-    Attributes
-    ----------
-    residual_px : (N, 2) float64
-        Source pixels; NaN where a fold left too few points.
-    distance2 : (N,) float64
-        Squared Mahalanobis distance, capped, so that one outlier does not decide.
-    """
-
-    residual_px: FloatArray
-    distance2: FloatArray
-
-
 def spatial_blocks(xy: FloatArray, per_axis: int = _BLOCKS) -> IntArray:
     """(N,) block number of each point on a `per_axis` × `per_axis` grid over their extent."""
     low, high = xy.min(axis=0), xy.max(axis=0)
@@ -66,22 +50,22 @@ def fold_numbers(xy: FloatArray) -> IntArray:
     return np.asarray((block % _BLOCKS + 2 * (block // _BLOCKS)) % FOLDS, dtype=np.intp)
 
 
-def held_out(model: str, points: Observations, estimate: Estimate) -> HeldOut:
-    """Predict every point by a fit without its fold.
+def held_out(points: Observations, estimate: Estimate) -> FloatArray:
+    """(N, 2) errors of every point as a fit without its fold predicts it, source pixels.
+
+    NaN where a fold leaves too few points.
 
     Parameters
     ----------
-    model : str
     points : Observations
     estimate : Estimate
         Of all points; gives the weights, so that a fold needs one linear solution.
     """
-    frame = estimate.frame
-    inverse = np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
-    student = student_weight(estimate.distance2)
-    weight = inverse * (student * estimate.inlier)[:, None, None]
+    model, frame = estimate.model, estimate.frame
+    weight = _precision(points, estimate)
+    weight = weight * (student_weight(estimate.distance2) * estimate.inlier)[:, None, None]
     folds = fold_numbers(points.source)
-    residual = np.full((len(points), 2), np.nan)
+    error = np.full((len(points), 2), np.nan)
     for fold in range(FOLDS):
         out = folds == fold
         rest = ~out & estimate.inlier
@@ -89,9 +73,13 @@ def held_out(model: str, points: Observations, estimate: Estimate) -> HeldOut:
             continue
         parameters, _ = weighted_fit(model, points.take(rest), weight[rest], frame)
         predicted = fitted_map(model, parameters, frame)
-        residual[out] = predicted.forward(points.source[out]) - points.target[out]
-    distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
-    return HeldOut(residual, np.minimum(distance2, REJECT_D2))
+        error[out] = predicted.forward(points.source[out]) - points.target[out]
+    return error
+
+
+def _precision(points: Observations, estimate: Estimate) -> FloatArray:
+    """(N, 2, 2) inverse covariances, with the variance that all points have besides their own."""
+    return np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,14 +89,15 @@ class Selection:
     Attributes
     ----------
     estimate : Estimate
-    check : HeldOut
+    held_out_px : (N, 2) float64
+        Of the points, source pixels; NaN where not known.
     neglected_px : float
         Source pixels by which rotation and shear, that are likely but not worth it, would move the
         worst corner.
     """
 
     estimate: Estimate
-    check: HeldOut
+    held_out_px: FloatArray
     neglected_px: float = 0.0
 
 
@@ -163,8 +152,7 @@ def select_model(
         one that does not; infinite for none.
     """
     if model != "auto":
-        estimate = robust_fit(model, points, frame)
-        return Selection(estimate, held_out(model, points, estimate))
+        return select_one(model, points, frame)
     candidates = [name for name in MODEL_ORDER if len(points) >= minimum_points(name)]
     full, neglected = robust_fit(candidates[-1], points, frame), 0.0
     level = [name for name in candidates if name in NORTH_UP]
@@ -175,23 +163,37 @@ def select_model(
             doubt = _DOUBT_SIGMAS * full.map.sigma_at(corners)
             neglected = float(np.sqrt(np.maximum(tilt**2 - doubt**2, 0.0)).max())
             candidates, full = level, upright
-    check_full = held_out(candidates[-1], points, full)
+    precision, errors = _precision(points, full), held_out(points, full)
+
+    def distance2(error: FloatArray) -> FloatArray:
+        """Squared, in variances; capped, so that one outlier does not decide."""
+        return np.minimum(np.einsum("ni,nij,nj->n", error, precision, error), REJECT_D2)
+
     blocks = spatial_blocks(points.source)
     for name in candidates[:-1]:
-        estimate = robust_fit(name, points, frame, extra_variance_px2=full.extra_variance_px2)
-        check = held_out(name, points, estimate)
-        if _paired_t(check.distance2 - check_full.distance2, blocks) < _SIGNIFICANT_T:
-            estimate = robust_fit(name, points, frame)
-            return Selection(estimate, held_out(name, points, estimate), neglected)
-    return Selection(full, check_full, neglected)
+        simpler = robust_fit(name, points, frame, extra_variance_px2=full.extra_variance_px2)
+        worse = distance2(held_out(points, simpler)) - distance2(errors)
+        if _paired_t(worse, blocks) < _SIGNIFICANT_T:
+            return replace(select_one(name, points, frame), neglected_px=neglected)
+    return Selection(full, errors, neglected)
 
 
-def select_again(
-    model: str, points: Observations, frame: Frame, spread_px2: float, weight: FloatArray
+def select_one(
+    model: str,
+    points: Observations,
+    frame: Frame,
+    spread_px2: float | None = None,
+    weight: FloatArray | None = None,
 ) -> Selection:
-    """The fit that gave points their weights, with others (NaN) beside them."""
+    """Fit one model; with a spread and weights as an earlier fit gave them, which it then repeats.
+
+    Parameters
+    ----------
+    model, points, frame, spread_px2, weight
+        As for `geodelreg.fit.estimate.robust_fit`.
+    """
     estimate = robust_fit(model, points, frame, spread_px2, weight)
-    return Selection(estimate, held_out(model, points, estimate))
+    return Selection(estimate, held_out(points, estimate))
 
 
 def select_for(pair: Pair, points: Observations) -> Selection:
@@ -241,7 +243,7 @@ def half_disagreement(points: Observations, estimate: Estimate, corners: FloatAr
         white = np.argsort(np.argsort(block, kind="stable")) % 2 == 0
     if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
         return float("inf")
-    weight = np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
+    weight = _precision(points, estimate)
     ends = []
     for half in (white, ~white):
         parameters, _ = weighted_fit(model, points.take(half), weight[half], estimate.frame)

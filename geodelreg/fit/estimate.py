@@ -177,7 +177,7 @@ def robust_fit(
             columns, right = _system(model, points, frame, parameters)
         residual = fitted_map(model, parameters, frame).forward(points.source) - points.target
         if extra_variance_px2 is None and number < _SPREAD_ROUNDS:
-            extra = _variance_left(residual, variances, axes)
+            extra = common_variance(residual, variances, axes)
             inverse = _inverse(points.covariance, extra)
         distance2 = np.einsum("ni,nij,nj->n", residual, inverse, residual)
         student = np.where(np.isfinite(known), known, student_weight(distance2))
@@ -234,24 +234,20 @@ def _response(distance2: FloatArray) -> float:
     return float((weight * _STUDENT_DOF / (_STUDENT_DOF + distance2)).sum() / weight.sum())
 
 
-def common_variance(residual: FloatArray, covariance: FloatArray) -> float:
+def common_variance(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
     """Variance per axis to add to every covariance so that the median distance is that of χ²(2).
 
     Parameters
     ----------
     residual : (N, 2) float64
-    covariance : (N, 2, 2) float64
+    variances, axes : (N, 2), (N, 2, 2) float64
+        Eigenvalues and eigenvectors of the covariances.
 
     Returns
     -------
     float
         0 when the covariances already explain the residuals.
     """
-    return _variance_left(residual, *np.linalg.eigh(covariance))
-
-
-def _variance_left(residual: FloatArray, variances: FloatArray, axes: FloatArray) -> float:
-    """`common_variance` from the eigenvalues and eigenvectors of the covariances."""
     if not residual.any():
         return 0.0
     one, other = np.einsum("nji,nj->in", axes, residual) ** 2

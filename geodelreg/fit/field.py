@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fit.choice import FOLDS, HeldOut, Selection, fold_numbers, spatial_blocks
+from geodelreg.fit.choice import FOLDS, Selection, fold_numbers, spatial_blocks
 from geodelreg.fit.estimate import REJECT_D2, Estimate, Observations, student_weight
 from geodelreg.fit.models import Frame
 from geodelreg.geo.maps.field import FieldMap
@@ -274,7 +274,7 @@ def selection_of(field: Follower, distance2: FloatArray, frame: Frame) -> Select
     )
     none, all_of_them = np.empty(0), np.ones(len(field.source), dtype=np.bool_)
     estimate = Estimate(model, field, none, none, frame, extra, all_of_them, distance2)
-    return Selection(estimate, HeldOut(held_out_errors(field), distance2))
+    return Selection(estimate, held_out_errors(field))
 
 
 def halves_apart(field: Follower) -> float:

@@ -4,8 +4,8 @@ A model M turns the geotransform G into G ∘ M.  ``shift`` and ``scale`` (shift
 keep a north-up raster north-up; ``similarity`` is one on the ground, whatever the pixel's shape.
 ``projective`` is no affine: no geotransform holds it, and `auto` never takes it.
 
-A new model is a branch of `design` and of `fitted_map`, with its name in `PARAMETER_COUNT`;
-CONTRIBUTING lists what else knows models by name.
+A new linear model is a branch of `generators`, with its name in `PARAMETER_COUNT`; CONTRIBUTING
+lists what else knows models by name.
 """
 
 from __future__ import annotations
@@ -93,18 +93,11 @@ def design(
         return _projective_design(
             u, np.zeros(PARAMETER_COUNT[model]) if parameters is None else parameters
         )
-    x, y = u[:, 0], u[:, 1]
-    columns = np.zeros((len(u), 2, PARAMETER_COUNT[model]))
-    columns[:, 0, 0] = 1.0
-    columns[:, 1, 1] = 1.0
-    if model == "scale":
-        columns[:, 0, 2], columns[:, 1, 3] = x, y
-    elif model == "affine":
-        columns[:, 0, 2], columns[:, 0, 3] = x, y
-        columns[:, 1, 4:] = u
-    elif model == "similarity":
-        growth, turn = _similarity_generators(frame)
-        columns[:, :, 2], columns[:, :, 3] = u @ growth.T, u @ turn.T
+    ways = generators(model, frame)
+    columns = np.zeros((len(u), 2, 2 + len(ways)))
+    columns[:, (0, 1), (0, 1)] = 1.0
+    for number, way in enumerate(ways, 2):
+        columns[:, :, number] = u @ way.T
     return columns, u
 
 
@@ -122,10 +115,17 @@ def _affine_columns(u: FloatArray) -> FloatArray:
     return design("affine", u, Frame((0.0, 0.0), 1.0))[0]
 
 
-def _similarity_generators(frame: Frame) -> tuple[FloatArray, FloatArray]:
-    metric = np.array(frame.metric).reshape(2, 2)
-    turn = np.linalg.inv(metric) @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ metric
-    return np.eye(2), turn
+def generators(model: str, frame: Frame) -> FloatArray:
+    """(K, 2, 2) how each parameter of a linear model beyond its shift changes steps of pixels."""
+    if model == "scale":
+        return np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
+    if model == "affine":
+        return np.eye(4).reshape(-1, 2, 2)
+    if model == "similarity":
+        metric = np.array(frame.metric).reshape(2, 2)
+        turn = np.linalg.inv(metric) @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ metric
+        return np.stack([np.eye(2), turn])
+    return np.empty((0, 2, 2))
 
 
 def fitted_map(
@@ -147,13 +147,8 @@ def fitted_map(
     if model == "projective":
         return ProjectiveMap(_homography(parameters, frame), sigma)
     linear = np.eye(2)
-    if model == "scale":
-        linear = np.diag(1.0 + parameters[2:4])
-    elif model == "affine":
-        linear = np.eye(2) + parameters[2:].reshape(2, 2)
-    elif model == "similarity":
-        growth, turn = _similarity_generators(frame)
-        linear = np.eye(2) + parameters[2] * growth + parameters[3] * turn
+    for amount, way in zip(parameters[2:], generators(model, frame), strict=True):
+        linear = linear + amount * way
     centre = np.array(frame.centre)
     offset = centre - linear @ centre + parameters[:2] * frame.span_px
     return AffineMap(affine_from_matrix(np.column_stack([linear, offset])), sigma)

@@ -40,7 +40,7 @@ class Residual:
 
 
 def residual_of(
-    field: FieldMap, correction: PixelMap, xy: FloatArray, scale: FloatArray, seed: int = 0
+    field: FieldMap, correction: PixelMap, xy: FloatArray, scale: FloatArray
 ) -> Residual:
     """Size of what a correction leaves of a field, by conditional simulation.
 
@@ -56,12 +56,10 @@ def residual_of(
         Some 200 places in sight.
     scale : (2, 2) float64
         Header pixels to the pixels that distances are told in.
-    seed : int
-        Of the simulation.
     """
     gap = field.forward(xy) - correction.forward(xy)
     covariance = field.joint_covariance(xy)
-    random = np.random.default_rng(seed).standard_normal((2, len(xy), _DRAWS))
+    random = np.random.default_rng(0).standard_normal((2, len(xy), _DRAWS))
     draws = np.stack(
         [
             mean[:, None] + _root(own) @ numbers

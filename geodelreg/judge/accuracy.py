@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
-from geodelreg.fit.choice import HeldOut, Selection
+from geodelreg.fit.choice import Selection
 from geodelreg.geo.grid import outline
 from geodelreg.judge.unshared import PULL_PX
 from geodelreg.pair import Pair, Roles, overlap_corners
@@ -56,7 +56,7 @@ def measure_points(
     correction = selection.estimate.map
     unmoved = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
     fit = points.residual_px[kept]
-    check_px, check_m = _held_out(pair, points, selection.check, selection)
+    check_px, check_m = _held_out(pair, points, selection)
     ratio = pair.pan_px_per_source_px
     floor = math.hypot(SYSTEMATIC_PX, PULL_PX * math.sqrt(unshared)) * pair.pan_px_per_coarser_px
     pan_m = float(np.sqrt(pair.reference_gsd_m[0] * pair.reference_gsd_m[1]))
@@ -86,12 +86,9 @@ def _sigma(selection: Selection, xy: FloatArray) -> float:
     return float(selection.estimate.map.sigma_at(xy).max())
 
 
-def _held_out(
-    pair: Pair, points: TiePoints, check: HeldOut, selection: Selection
-) -> tuple[FloatArray, FloatArray]:
+def _held_out(pair: Pair, points: TiePoints, selection: Selection) -> tuple[FloatArray, FloatArray]:
     """Held-out residuals of the kept points, in PAN pixels and in metres."""
-    inlier = selection.estimate.inlier
-    residual = check.residual_px[inlier]
+    residual = selection.held_out_px[selection.estimate.inlier]
     at = points.source_px[points.kept]
     local = pair.header.linearise(selection.estimate.map.forward(at))[:, :, :2]
     in_pan = np.einsum("pij,pj->pi", local, residual)
@@ -100,16 +97,12 @@ def _held_out(
 
 def _rms(vectors: FloatArray) -> float:
     good = vectors[np.isfinite(vectors).all(axis=1)]
-    return float(np.sqrt((good**2).sum(axis=1).mean())) if len(good) else float("nan")
+    return float(np.sqrt((good**2).sum(axis=1).mean())) if len(good) else math.nan
 
 
 def _ce90(vectors: FloatArray) -> float:
     good = vectors[np.isfinite(vectors).all(axis=1)]
-    return (
-        float(np.percentile(np.hypot(good[:, 0], good[:, 1]), _CE_PERCENT))
-        if len(good)
-        else math.nan
-    )
+    return float(np.percentile(np.hypot(*good.T), _CE_PERCENT)) if len(good) else math.nan
 
 
 def _coverage(part: Roles, points: TiePoints, correction: PixelMap) -> float:

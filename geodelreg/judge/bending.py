@@ -179,7 +179,7 @@ def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
         apart_px = pair.pan_px_per_source_px * halves_apart(field)
         # a field follows its points: those that it has not seen say what chance would do
         unseen = tied.residual_px.copy()
-        unseen[tied.kept] = pair.pan_px_per_source_px * selection.check.residual_px
+        unseen[tied.kept] = pair.pan_px_per_source_px * selection.held_out_px
         log_nfa = patches_log_nfa(
             refined.part, replace(tied, residual_px=unseen), points_that_fix("field")
         )

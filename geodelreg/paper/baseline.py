@@ -126,8 +126,7 @@ def with_patches(pair: Pair, fit: PaperFit) -> Found | None:
         area = refine(roles(pair), fit)
     if area is None:
         return None
-    check = held_out(fit.estimate.model, fit.observations, fit.estimate)
-    selection = Selection(fit.estimate, check)
+    selection = Selection(fit.estimate, held_out(fit.observations, fit.estimate))
     apart = _apart(pair, fit, area)
     return Found(fit, area, Fitted(selection, fit.points, fit.counts, fit.log_nfa, apart))
 

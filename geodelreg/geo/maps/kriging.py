@@ -169,6 +169,6 @@ def _upper(factor: FloatArray, right: FloatArray) -> FloatArray:
 
 def distances(one: FloatArray, other: FloatArray) -> FloatArray:
     """(N, M) distances between (N, 2) and (M, 2) points."""
-    gap2 = (one[:, None, 0] - other[None, :, 0]) ** 2
-    gap2 += (one[:, None, 1] - other[None, :, 1]) ** 2
-    return np.asarray(np.sqrt(gap2))
+    from scipy.spatial.distance import cdist
+
+    return np.asarray(cdist(one, other))
