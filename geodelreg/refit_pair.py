@@ -329,15 +329,15 @@ def _snapped(pair: Pair, given: GivenPoints, by_hand: BoolArray) -> tuple[GivenP
         )
     start = select_for(replace(pair, options=replace(pair.options, model="auto")), points)
     chosen = np.flatnonzero(by_hand)
-    found = snap_points(
+    found, correlation = snap_points(
         roles(pair), given.source_px[chosen], given.target_px[chosen], start.estimate.map
     )
-    good = np.isfinite(found.points.source).all(axis=1)
+    good = np.isfinite(found.source).all(axis=1)
     hit = chosen[good]
     source, target = given.source_px.copy(), given.target_px.copy()
     covariance, score = given.covariance_px2.copy(), given.score.copy()
-    source[hit], target[hit] = found.points.source[good], found.points.target[good]
-    covariance[hit], score[hit] = found.points.covariance[good], found.correlation[good]
+    source[hit], target[hit] = found.source[good], found.target[good]
+    covariance[hit], score[hit] = found.covariance[good], correlation[good]
     measured = replace(
         given, source_px=source, target_px=target, covariance_px2=covariance, score=score
     )

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from geodelreg.fine.overlay import Overlay
+from geodelreg.fine.survey import beyond
 from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
 
 _PIXELS = 90_000  # at most, 300²; by hand: ½ to 2 × alike
@@ -59,26 +60,17 @@ def best_shift(overlay: Overlay) -> Shift:
     scores *= np.sqrt(np.maximum(overlap, 0.0))
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(scores)), scores.shape))
     height, width = one.shape
-    across = _vertex(scores[row], column)
-    down = _vertex(scores[:, column], row)
-    moved = np.array([width - 1 - across, height - 1 - down])
+    # steps of its own, for the last bits of a Fourier transform depend on where its memory lies
+    across, down = (
+        round(part * _VERTEX_STEPS) / _VERTEX_STEPS
+        for part in (beyond(scores[row], column), beyond(scores[:, column], row))
+    )
+    moved = np.array([width - 1 - (column + across), height - 1 - (row + down)])
     rows, columns = overlay.template.shape
     best = float(scores[row, column])
     scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
     rival = float(scores.max()) / best if best > 0 else 1.0
     return Shift(np.asarray(moved * np.array([columns / width, rows / height])), rival)
-
-
-def _vertex(scores: Float32Array, best: int) -> float:
-    """Where the parabola through the best score and its neighbours is highest."""
-    if not 0 < best < len(scores) - 1:
-        return float(best)
-    before, here, after = (float(score) for score in scores[best - 1 : best + 2])
-    bend = before - 2 * here + after
-    if not bend < 0:
-        return float(best)
-    # a step of its own, for the last bits of a Fourier transform depend on where its memory lies
-    return best + round((before - after) / (2 * bend) * _VERTEX_STEPS) / _VERTEX_STEPS
 
 
 def around(centre: int, reach: int) -> slice:

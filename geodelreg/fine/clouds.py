@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geodelreg.fine.motions import neighbours
-from geodelreg.fit.chance import log10_signed_rank_tail, positive_rank_share
+from geodelreg.fit.chance import signed_ranks
 from geodelreg.values.raster import TINY, BoolArray, FloatArray
 
 _AMONG = 0.5
@@ -79,7 +79,7 @@ def cloud_look(xy: FloatArray, moves: BoolArray, brightest: FloatArray) -> Cloud
     around = np.bincount(one, brightest[other], minlength=len(xy))[beside] / count[beside]
     brighter = brightest[beside] - around
     among = int(beside.sum()) / int(moves.sum())
-    return CloudLook(among, log10_signed_rank_tail(brighter), positive_rank_share(brighter))
+    return CloudLook(among, *signed_ranks(brighter))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from affine import Affine
 
-from geodelreg.fine.least_squares import MatchOptions
+from geodelreg.fine.least_squares import Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
 from geodelreg.fine.tiles import PATCH_PX, plan_tiles, read_tile, read_tiles
 from geodelreg.fine.tuning import DEFAULT_SIGMA, Tuning, fit_sigma, fit_tone
@@ -23,24 +21,9 @@ _ITERATIONS = 8  # a hand puts points a pixel off, a field of patches less
 _TOLERANCE = 0.005  # of a patch pixel
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Snapped:
-    """Where the points were measured.
-
-    Attributes
-    ----------
-    points : Observations
-        In MS pixels, at the centres of the patches; NaN of points that did not match.
-    correlation : (N,) float64
-    """
-
-    points: Observations
-    correlation: FloatArray
-
-
 def snap_points(
     part: Roles, source_px: FloatArray, target_px: FloatArray, start: PixelMap
-) -> Snapped:
+) -> tuple[Observations, FloatArray]:
     """Measure points where a person has put them, or where the other points say.
 
     Parameters
@@ -50,20 +33,31 @@ def snap_points(
         MS pixel, NaN where it is to be found by `start`, and MS header pixel.
     start : PixelMap
         MS pixels to MS header pixels, by other points.
+
+    Returns
+    -------
+    points : Observations
+        In MS pixels, at the centres of the patches; NaN of points that did not match.
+    correlation : (N,) float64
     """
     count = len(source_px)
     points = Observations(
         np.full((count, 2), np.nan), np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     )
-    found = Snapped(points, np.full(count, np.nan))
+    correlation = np.full(count, np.nan)
     tuning = _tuning(part, start)
     if tuning is None:
-        return found
+        return points, correlation
     for index, (source, target) in enumerate(zip(source_px, target_px, strict=True)):
         for near in _starts(source, target, start):
-            if _match(part, target, near, tuning, found, index):
+            matched = _matched(part, target, near, tuning)
+            if matched is not None:
+                seen = observe(part, matched, near)
+                points.source[index], points.target[index] = seen.source[0], seen.target[0]
+                points.covariance[index] = seen.covariance[0]
+                correlation[index] = abs(matched.correlation[0])
                 break
-    return found
+    return points, correlation
 
 
 def _tuning(part: Roles, start: PixelMap) -> Tuning | None:
@@ -91,29 +85,20 @@ def _starts(source: FloatArray, target: FloatArray, start: PixelMap) -> list[Pix
     return [start.then(AffineMap(Affine.translation(*off.tolist()))), start]
 
 
-def _match(
-    part: Roles, target: FloatArray, near: PixelMap, tuning: Tuning, found: Snapped, index: int
-) -> bool:
-    """Match the patch at a point and keep it in `found`; False where it does not match."""
+def _matched(part: Roles, target: FloatArray, near: PixelMap, tuning: Tuning) -> Matched | None:
+    """The patch at a point; None where it does not match."""
     at = near.inverse(target[None])
     centre = at[0] if part.ms_is_template else part.pair.header.forward(target[None])[0]
     size = PATCH_PX * part.step
     height, width = part.template.grid.shape
     if not np.isfinite(centre).all():
-        return False
+        return None
     column, row = np.rint(centre - size / 2).astype(int).tolist()
     if column < 0 or row < 0 or column + size > width or row + size > height:
-        return False
+        return None
     tile = read_tile(part, Window(column, row, size, size), near)
     if tile is None:
-        return False
+        return None
     options = MatchOptions(PATCH_PX, _ITERATIONS, _TOLERANCE)
     matched = match_tiles(part, [tile], near, tuning, options)
-    if len(matched.status) != 1 or matched.status[0] != Status.KEPT:
-        return False
-    seen = observe(part, matched, near)
-    found.points.source[index] = seen.source[0]
-    found.points.target[index] = seen.target[0]
-    found.points.covariance[index] = seen.covariance[0]
-    found.correlation[index] = abs(matched.correlation[0])
-    return True
+    return matched if matched.status.tolist() == [Status.KEPT] else None

@@ -21,7 +21,6 @@ REACH_PX = 22
 """Of the search; with patches of 20 pixels, the largest, the windows measure 64."""
 
 _BRIGHTEST_PERCENT = 95  # what a cloud covers of a patch that it moves, at the least
-_COLUMNS = 8  # of what is noted of a patch, below
 _MOST_R = 0.999  # below 1, where Fisher's transformation ends
 _ROUNDED_R = 1.001  # above 1 by rounding; what lies beyond is flat
 _LEAST_VALID = 0.8  # by hand: ½ to 2 × alike
@@ -65,16 +64,13 @@ class Places:
         return np.asarray(better * np.sqrt(independent / 2))
 
 
-def survey(
-    overlay: Overlay, reach: int = REACH_PX, grid: tuple[str, str] = ("centred", "centred")
-) -> Places:
-    """Correlate every patch with all places up to `reach` pixels away.
+def survey(overlay: Overlay, grid: tuple[str, str] = ("centred", "centred")) -> Places:
+    """Correlate every patch with all places up to `REACH_PX` pixels away.
 
     Parameters
     ----------
     overlay : Overlay
         The surface under the correction to be judged.
-    reach : int
     grid : (str, str)
         Of patches, across and down: side by side and ``centred``, ``flush`` with the borders, or
         ``between`` those.
@@ -82,40 +78,38 @@ def survey(
     size = patch_size(float(overlay.valid.sum()))
     template = _filled(overlay.template, overlay.template_valid)
     surface = _filled(overlay.surface, overlay.surface_valid)
-    noise = noise_of(template, overlay.template_valid)
-    height, width = template.shape
+    reach, (height, width) = REACH_PX, template.shape
     padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
     across, down = (
         _starts(length, size, how) for length, how in zip((width, height), grid, strict=True)
     )
-    rows = []
-    for top in down:
-        for left in across:
-            mine = slice(top, top + size), slice(left, left + size)
-            shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
-            if min(shown) < _LEAST_VALID:
-                continue
-            patch = template[mine]
-            window = padded[top : top + size + 2 * reach, left : left + size + 2 * reach]
-            scores = np.abs(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
-            scores[~np.isfinite(scores) | (scores > _ROUNDED_R)] = 0.0
-            row, column = np.unravel_index(int(scores.argmax()), scores.shape)
-            move = _peak(scores, int(row), int(column)) - reach
-            rows.append(
-                [
-                    *(left + size / 2, top + size / 2),
-                    *move,
-                    *(scores[row, column], scores[reach, reach]),
-                    *(
-                        show_texture(patch[None], noise)[0],
-                        np.percentile(patch, _BRIGHTEST_PERCENT),
-                    ),
-                ]
-            )
-    found = np.array(rows).reshape(-1, _COLUMNS)
-    centre, move, rest = found[:, :2], found[:, 2:4], found[:, 4:].T
-    score, here, textured, brightest = rest
-    return Places(centre, move, score, here, textured > 0, brightest, size)
+
+    def is_shown(left: int, top: int) -> bool:
+        mine = slice(top, top + size), slice(left, left + size)
+        shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
+        return bool(min(shown) >= _LEAST_VALID)
+
+    corners = [(left, top) for top in down for left in across if is_shown(left, top)]
+    patches = np.empty((len(corners), size, size), dtype=np.float32)
+    move, score, here = np.empty((len(corners), 2)), *np.empty((2, len(corners)))
+    for number, (left, top) in enumerate(corners):
+        patch = template[top : top + size, left : left + size]
+        patches[number] = patch
+        window = padded[top : top + size + 2 * reach, left : left + size + 2 * reach]
+        scores = np.abs(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
+        scores[~np.isfinite(scores) | (scores > _ROUNDED_R)] = 0.0
+        row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
+        move[number] = column + beyond(scores[row], column), row + beyond(scores[:, column], row)
+        score[number], here[number] = scores[row, column], scores[reach, reach]
+    return Places(
+        np.reshape(corners, (-1, 2)) + size / 2,
+        move - reach,
+        score,
+        here,
+        show_texture(patches, noise_of(template, overlay.template_valid)),
+        np.percentile(patches, _BRIGHTEST_PERCENT, axis=(1, 2)).astype(np.float64),
+        size,
+    )
 
 
 def _starts(length: int, size: int, how: str) -> list[int]:
@@ -132,13 +126,10 @@ def _filled(image: Float32Array, valid: BoolArray) -> Float32Array:
     return np.where(valid, image - level, np.float32(0)).astype(np.float32)
 
 
-def _peak(scores: Float32Array, row: int, column: int) -> FloatArray:
-    """(2,) column and row of the maximum, by a parabola along each axis."""
-    out = np.array([column, row], dtype=np.float64)
-    for axis, (at, line) in enumerate(((column, scores[row]), (row, scores[:, column]))):
-        if 0 < at < len(line) - 1:
-            left, middle, right = (float(v) for v in line[at - 1 : at + 2])
-            bend = left - 2 * middle + right
-            if bend < 0:
-                out[axis] += (left - right) / (2 * bend)
-    return out
+def beyond(scores: Float32Array, best: int) -> float:
+    """How far past the best of a row of scores the parabola through it and its neighbours peaks."""
+    if not 0 < best < len(scores) - 1:
+        return 0.0
+    before, here, after = (float(score) for score in scores[best - 1 : best + 2])
+    bend = before - 2 * here + after
+    return (before - after) / (2 * bend) if bend < 0 else 0.0

@@ -21,7 +21,6 @@ _SPREAD_TILE_PATCHES = 4
 _SPREAD_TILE_PATCHES_FINE = 3
 _FINE_RATIO = 2.5  # by hand: ½ to 2 × alike
 _ADJOINING_TILE_PATCHES = 8  # by hand: ½: 1 of 36 refused, 1 twice as far off
-_MEMO = 1
 SMALLEST_PATCH_PX = 12  # square; by hand: 2 × refuses 5 of 36, ½: 1 thrice as far off
 _WANTED_PATCHES = 40  # five times what the gate asks; by hand: ½ refuses 1 of 36, 2 × too
 _MOST_TILES_PER_AXIS = 7  # by hand: ½ to 2 × alike
@@ -49,12 +48,11 @@ class Tile:
     _lock: Lock = field(default_factory=Lock, repr=False)
 
     def low_passed(self, full: Grid, sigma_px: tuple[float, float], high_pass_px: float) -> Surface:
-        """`make_surface` of the first surface band; the last few are remembered."""
+        """`make_surface` of the first surface band; the last one is remembered."""
         key = (*sigma_px, high_pass_px)
         with self._lock:  # several threads may match different bands of one tile
             if key not in self._memo:
-                while len(self._memo) >= _MEMO:
-                    del self._memo[next(iter(self._memo))]
+                self._memo.clear()
                 self._memo[key] = make_surface(self.surface[0], full, sigma_px, high_pass_px)
             return self._memo[key]
 

@@ -68,35 +68,30 @@ def log10_binomial_tail(successes: int, trials: int, probability: float) -> floa
     return min(float(np.logaddexp.reduce(terms)) / _LN_10, 0.0)
 
 
-def log10_signed_rank_tail(differences: FloatArray) -> float:
-    """log10 of P(sum of the ranks of positive values as large), were signs a matter of chance.
-
-    By the normal approximation to Wilcoxon's statistic (1945, doi:10.2307/3001968), whose mean and
-    variance are exact.
+def signed_ranks(differences: FloatArray) -> tuple[float, float]:
+    """Whether positive values are larger than negative ones (Wilcoxon 1945, doi:10.2307/3001968).
 
     Parameters
     ----------
     differences : (N,) float64
         At least one.
+
+    Returns
+    -------
+    log10_tail : float
+        log10 of P(sum of the ranks of positive values as large), were signs a matter of chance: by
+        the normal approximation, whose mean and variance are exact.
+    share : float
+        Share of the sum of ranks that positive values hold; by chance about a half.
     """
     from scipy.special import log_ndtr
 
-    rank = _ranks(differences)
-    excess = float(rank[differences > 0].sum() - rank.sum() / 2)
-    spread = math.sqrt(float((rank**2).sum())) / 2
-    return float(log_ndtr(-excess / spread)) / _LN_10
-
-
-def positive_rank_share(differences: FloatArray) -> float:
-    """Share of the sum of ranks that positive ones of (N,) values hold; by chance about a half."""
-    rank = _ranks(differences)
-    return float(rank[differences > 0].sum() / rank.sum())
-
-
-def _ranks(differences: FloatArray) -> FloatArray:
-    """(N,) from 1, of the sizes of values."""
     order = np.argsort(np.abs(differences), kind="stable")
-    return np.argsort(order, kind="stable").astype(np.float64) + 1.0
+    rank = np.argsort(order, kind="stable").astype(np.float64) + 1.0
+    positive, total = rank[differences > 0].sum(), rank.sum()
+    spread = math.sqrt(float((rank**2).sum())) / 2
+    tail = float(log_ndtr(-float(positive - total / 2) / spread)) / _LN_10
+    return tail, float(positive / total)
 
 
 def _log_choose(n: IntArray | int, k: IntArray | int) -> FloatArray:

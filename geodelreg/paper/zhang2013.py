@@ -13,10 +13,11 @@ here are our reading.  `AS_PRINTED` is the method without them.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geodelreg.coarse.descriptors import match_descriptors, one_to_one, ratio_test
 from geodelreg.coarse.keypoints import OCTAVE_LAYERS, KeypointOptions
@@ -28,9 +29,7 @@ from geodelreg.geo.triangulation import (
     relative_altitude,
 )
 from geodelreg.values.points import Keypoints, Status, TiePoints
-from geodelreg.values.raster import BoolArray, FloatArray, IntArray
-
-StatusArray = NDArray[np.uint8]
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
 
 LOWE_CONTRAST = 0.03
 """Least contrast of a keypoint on a grey scale of 0 to 1 (Lowe 2004, section 4)."""
@@ -109,23 +108,15 @@ def match_zhang2013(
         Matches left after each step, in order.
     """
     options = options or ZhangOptions()
-    source_xy, reference_xy, ratio = _nearest_matches(source, reference)
-    points = (source_xy, reference_xy, ratio)
-    status = initial_status(ratio)
-    counts = {"nearest": _kept(status)}
-    status = reject_ambiguous(*points, status, options.ratio)
-    counts["ratio"] = _kept(status)
-    status = reject_duplicates(*points, status)
-    counts["one_to_one"] = _kept(status)
-    status = reject_collinear(*points, status, options.min_altitude)
-    counts["not_collinear"] = _kept(status)
-    status = reject_cocircular(*points, status, options.min_incircle)
-    counts["not_cocircular"] = _kept(status)
-    status = reject_ambiguous(*points, status, options.final_ratio)
-    counts["final_ratio"] = _kept(status)
-    status = reject_unshared(*points, status, options.min_shared_edges)
-    counts["corresponding"] = _kept(status)
-    return _tie_points(*points, status, options.sigma_px), counts
+    steps = {
+        "ratio": partial(reject_ambiguous, limit=options.ratio),
+        "one_to_one": reject_duplicates,
+        "not_collinear": partial(reject_collinear, min_altitude=options.min_altitude),
+        "not_cocircular": partial(reject_cocircular, min_incircle=options.min_incircle),
+        "final_ratio": partial(reject_ambiguous, limit=options.final_ratio),
+        "corresponding": partial(reject_unshared, min_shared_edges=options.min_shared_edges),
+    }
+    return _after(steps, source, reference, options.sigma_px)
 
 
 def match_sift(
@@ -136,12 +127,33 @@ def match_sift(
     Parameters and results as for `match_zhang2013`.
     """
     options = options or ZhangOptions()
-    source_xy, reference_xy, ratio = _nearest_matches(source, reference)
+    steps = {"ratio": partial(reject_ambiguous, limit=options.ratio)}
+    return _after(steps, source, reference, options.sigma_px)
+
+
+def _after(
+    steps: Mapping[str, Callable[..., StatusArray]],
+    source: Keypoints,
+    reference: Keypoints,
+    sigma_px: float,
+) -> tuple[TiePoints, dict[str, int]]:
+    """Nearest neighbours, and what each of the steps leaves of them."""
+    matches = match_descriptors(source, reference)
+    (source_xy, reference_xy), ratio = matches.xy(source, reference), matches.ratio
     status = initial_status(ratio)
     counts = {"nearest": _kept(status)}
-    status = reject_ambiguous(source_xy, reference_xy, ratio, status, options.ratio)
-    counts["ratio"] = _kept(status)
-    return _tie_points(source_xy, reference_xy, ratio, status, options.sigma_px), counts
+    for name, step in steps.items():
+        status = step(source_xy, reference_xy, ratio, status)
+        counts[name] = _kept(status)
+    points = TiePoints(
+        source_px=source_xy,
+        reference_px=reference_xy,
+        covariance_px2=np.tile(sigma_px**2 * np.eye(2), (len(ratio), 1, 1)),
+        score=1.0 - ratio,
+        status=status,
+        residual_px=np.full((len(ratio), 2), np.nan),
+    )
+    return points, counts
 
 
 def initial_status(ratio: FloatArray) -> StatusArray:
@@ -297,34 +309,9 @@ def _worst_of_groups(
     return gone
 
 
-def _nearest_matches(
-    source: Keypoints, reference: Keypoints
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    matches = match_descriptors(source, reference)
-    return *matches.xy(source, reference), matches.ratio
-
-
 def _kept(status: StatusArray) -> int:
     return int((status == Status.KEPT).sum())
 
 
 def _rejected(status: StatusArray, which: BoolArray, reason: Status) -> StatusArray:
     return np.where(which & (status == Status.KEPT), reason, status).astype(np.uint8)
-
-
-def _tie_points(
-    source_xy: FloatArray,
-    reference_xy: FloatArray,
-    ratio: FloatArray,
-    status: StatusArray,
-    sigma_px: float,
-) -> TiePoints:
-    count = len(ratio)
-    return TiePoints(
-        source_px=source_xy,
-        reference_px=reference_xy,
-        covariance_px2=np.tile(sigma_px**2 * np.eye(2), (count, 1, 1)),
-        score=1.0 - ratio,
-        status=status,
-        residual_px=np.full((count, 2), np.nan),
-    )

@@ -229,10 +229,6 @@ class Gcp:
     form: FitForm | None = None
 
 
-def _nowhere() -> FloatArray:
-    return np.empty((0, 2))
-
-
 @dataclass(frozen=True, slots=True)
 class Scope:
     """Which part of the rasters a search looks at, and at which size.
@@ -303,8 +299,8 @@ class Guess:
     log_nfa: float
     counts: dict[str, int]
     images: Overview
-    source_px: FloatArray = field(default_factory=_nowhere)
-    header_px: FloatArray = field(default_factory=_nowhere)
+    source_px: FloatArray = field(default_factory=lambda: _NOWHERE)
+    header_px: FloatArray = field(default_factory=lambda: _NOWHERE)
     candidates: int = 0
     bright: tuple[BoolArray, BoolArray] | None = None
 
