@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from geodelreg.fine.fitted import Found, fit_patches, patch_counts
 from geodelreg.fine.layers import Claim
@@ -81,18 +80,21 @@ def carry(pair: Pair, found: Found, heard: Sequence[Claim], bent: bool = False) 
     bent : bool
         One affine was refused: only a field will do.
     """
-    seen = see_all(pair, found) if pair.may_bend else None
-    if seen is not None and seen.must_follow(pair, bent):
-        return _of_a_field(pair, found, seen.whole, heard)  # which alone needs its evidence
+    seen = _see_all(pair, found) if pair.may_bend else None
+    if seen is not None:
+        whole, _, closer = seen
+        asked = bent or pair.options.model in FOLLOWING or closer.is_bent(pair.options)
+        if asked and _may_follow(pair, whole):
+            return _of_a_field(pair, found, whole, heard)  # which alone needs its evidence
     first = _judged(found, heard)
     if not bent and not _is_believed(first, pair):
         return first
-    whole, everyone, closer = seen or see_all(pair, found)
+    whole, everyone, closer = seen or _see_all(pair, found)
     if everyone is not None:
         second = _judged(found._replace(fitted=everyone), heard)
         if _is_believed(second, pair):
             return second.known(closer.at_best(pair))
-        if may_follow(pair, whole):
+        if _may_follow(pair, whole):
             return _of_a_field(pair, found, whole, heard)
     return first.known(whole.at_best(pair))
 
@@ -107,58 +109,30 @@ def _is_believed(carried: Carried, pair: Pair) -> bool:
 
 
 def _of_a_field(pair: Pair, found: Found, whole: Whole, heard: Sequence[Claim]) -> Carried:
-    refined, fitted = follow(pair, found, whole)
+    refined, fitted = _follow(pair, found, whole)
     judged = _judged(Found(found.guess, refined, fitted), heard)
     return judged.known(whole.followed(pair, fitted))
 
 
-class AllPatches(NamedTuple):
-    """What all patches say about a map.
+def _see_all(pair: Pair, found: Found) -> tuple[Whole, Fitted | None, Whole]:
+    """What all patches say about a map; where it bends, a fit to all of them, and of that the same.
 
-    Attributes
-    ----------
-    whole : Whole
-    everyone : Fitted or None
-        The fit to all of the ground, where it is bent; None where those that agree spoke for it.
-    closer : Whole
-        Under that.
+    There is no such fit where those that agree spoke for the ground.
     """
-
-    whole: Whole
-    everyone: Fitted | None
-    closer: Whole
-
-    def must_follow(self, pair: Pair, bent: bool) -> bool:
-        """True when no affine will do, or none was asked for."""
-        options = pair.options
-        asked = bent or options.model in FOLLOWING or self.closer.is_bent(options)
-        return asked and may_follow(pair, self.whole)
-
-
-def see_all(pair: Pair, found: Found) -> AllPatches:
-    """Ask all patches about a map, and where they say that it bends, fit one to them."""
-    whole = look_at_whole(found.guess, found.refined, found.fitted.map)
-    everyone = hear_everyone(pair, found, whole)
-    return AllPatches(
-        whole, everyone, whole if everyone is None else whole.under(pair, everyone.map)
-    )
-
-
-def hear_everyone(pair: Pair, found: Found, whole: Whole) -> Fitted | None:
-    """The fit to all of the ground, where it is bent; None where those that agree spoke for it."""
-    asked = pair.options
+    asked, whole = pair.options, look_at_whole(found.guess, found.refined, found.fitted.map)
     if not whole.is_bent(asked) or asked.method != "delaunay" or asked.model in BEYOND_A_HEADER:
-        return None
+        return whole, None, whole
     status = whole.status(found.refined.last.status)
-    return fit_patches(pair, found.guess, found.refined, status)
+    everyone = fit_patches(pair, found.guess, found.refined, status)
+    return whole, everyone, whole if everyone is None else whole.under(pair, everyone.map)
 
 
-def may_follow(pair: Pair, whole: Whole) -> bool:
+def _may_follow(pair: Pair, whole: Whole) -> bool:
     """True when a field may be written, and clouds leave it enough of the ground."""
     return pair.may_bend and whole.clouds <= LEAST_SHARE
 
 
-def follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
+def _follow(pair: Pair, found: Found, whole: Whole) -> tuple[Refinement, Fitted]:
     """The ground's smooth map, matched through itself until it stands still.
 
     Too few patches leave what was found.

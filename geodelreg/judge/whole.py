@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from affine import Affine
 
 from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
 from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motions
@@ -18,11 +19,11 @@ from geodelreg.fine.passes import Refinement, bends_gently
 from geodelreg.fine.survey import REACH_PX, Places, survey
 from geodelreg.fine.tone import single_band
 from geodelreg.fit.choice import Fitted
+from geodelreg.fit.consensus import fit_plainly
 from geodelreg.fit.estimate import Observations
 from geodelreg.fit.field import FEWEST_POINTS, fit_field, spacing
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
-from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.tin import TinMap
 from geodelreg.judge.evidence import decimated
@@ -32,7 +33,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Status
-from geodelreg.values.raster import Band, BoolArray, FloatArray, IntArray, StatusArray
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
 from geodelreg.values.result import Accuracy
 
 _CALM_SHARE = 0.98
@@ -97,9 +98,7 @@ class Whole:
             return self
         assert self.field is not None
         at = _sample(self.field)
-        columns = np.column_stack([at, np.ones(len(at))])
-        matrix = np.asarray(np.linalg.lstsq(columns, self.field.forward(at), rcond=None)[0].T)
-        best = self.under(pair, AffineMap.of(matrix))
+        best = self.under(pair, fit_plainly(at, self.field.forward(at), "affine"))
         return best if best.is_bent(pair.options) else self
 
     def status(self, last: StatusArray) -> StatusArray:
@@ -193,19 +192,23 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     if textured >= _FEW_PATCHES:
         return agreed
     # few patches leave out a border as wide as a small part
-    template, _, surface = decimated(guess, refined, dark=False)
-    images = overlay(refined.part, template, surface, correction)
-    moved, words = _small_motion(refined, images, _unit(refined, template))
+    moved, words = _small_motion(refined, *_overlaid(guess, refined, correction))
     return replace(agreed, moved=moved, words=words)
 
 
-def _unit(refined: Refinement, template: Band) -> float:
-    """Pixels of full resolution in one of a decimated image, along an axis."""
+def _overlaid(guess: Guess, refined: Refinement, correction: PixelMap) -> tuple[Overlay, Affine]:
+    """Both images, decimated, bright objects too, and pixels of that to those of the template."""
+    template, _, surface = decimated(guess, refined, dark=False)
     to_full = ~refined.part.template.grid.transform @ template.grid.transform
+    return overlay(refined.part, template, surface, correction), to_full
+
+
+def _unit(to_full: Affine) -> float:
+    """Pixels of full resolution in one of a decimated image, along an axis."""
     return float(np.sqrt(abs(to_full.determinant)))
 
 
-def _small_motion(refined: Refinement, images: Overlay, unit: float) -> tuple[float, str]:
+def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> tuple[float, str]:
     """The same as `_other_motion` of patches on other grids, where there are few on one.
 
     A part no wider than a patch or two lies astride two rows of one grid, and fills a row of
@@ -220,7 +223,7 @@ def _small_motion(refined: Refinement, images: Overlay, unit: float) -> tuple[fl
         ground = _ground_of(places, index)
         if ground.look.outshining >= OUTSHINING:
             continue
-        moved, words = _other_motion(refined, places, index, ground, unit)
+        moved, words = _other_motion(refined, places, index, ground, to_full)
         if moved:
             return moved, words
     return 0.0, ""
@@ -229,17 +232,14 @@ def _small_motion(refined: Refinement, images: Overlay, unit: float) -> tuple[fl
 def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
     """Where every patch lies: the ground's, another motion's, or a cloud's."""
     part = refined.part
-    template, _, surface = decimated(guess, refined, dark=False)
-    images = overlay(part, template, surface, correction)
+    images, to_full = _overlaid(guess, refined, correction)
     places = survey(images)
     index = np.flatnonzero(_placed(places))
     if len(index) < FEWEST_POINTS:
         return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
     ground = _ground_of(places, index)
-    to_full = ~part.template.grid.transform @ template.grid.transform
-    unit = _unit(refined, template)
-    unseen = refined.dark_only | (np.hypot(*move.T) * unit > MAX_MOVE * part.step)
+    unseen = refined.dark_only | (np.hypot(*move.T) * _unit(to_full) > MAX_MOVE * part.step)
     far = ground.member & unseen
     linear = affine_matrix(to_full)[:, :2] * _SURVEY_SIGMA_PX
     there = part.to_surface(correction)
@@ -254,9 +254,9 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     # what a smooth field explains is no cloud, however bright and high above the ground
     if ground.look.explains and not gentle:
         return replace(agreed, clouds=ground.moving)
-    moved, words = _other_motion(refined, places, index, ground, unit)
+    moved, words = _other_motion(refined, places, index, ground, to_full)
     if not moved and len(places.centre) < _FEW_PATCHES:
-        moved, words = _small_motion(refined, images, unit)
+        moved, words = _small_motion(refined, images, to_full)
     if moved or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
@@ -309,7 +309,7 @@ def _placed(places: Places) -> BoolArray:
 
 
 def _other_motion(
-    refined: Refinement, places: Places, index: IntArray, ground: Ground, unit: float
+    refined: Refinement, places: Places, index: IntArray, ground: Ground, to_full: Affine
 ) -> tuple[float, str]:
     """Share of the textured patches with the largest other motion, and where they lie, in words."""
     part, at, move = refined.part, places.centre[index], places.move[index]
@@ -322,11 +322,9 @@ def _other_motion(
     motion = motions[0]
     share = float(motion.member.sum()) / textured
     size = places.centre.max(axis=0) + places.centre.min(axis=0)
-    step = motion.move * unit * part.pan_px_per_patch_px / part.step
-    return (
-        share,
-        f"{region(at, motion.member, size)} {lies(-step if part.ms_is_template else step)}",
-    )
+    step = motion.move * _unit(to_full) * part.pan_px_per_patch_px / part.step
+    place = lies(-step if part.ms_is_template else step)
+    return share, f"{region(at, motion.member, size)} {place}"
 
 
 def _bent(
