@@ -28,11 +28,11 @@ def match_descriptors(source: Keypoints, reference: Keypoints) -> Matches:
     """
     if len(source) == 0 or len(reference) < 2:
         none = np.empty(0, dtype=np.intp)
-        return Matches(none, none, np.empty(0), np.empty(0))
+        return Matches(none, none, np.empty(0))
     nearest, best, second = _two_nearest(source.descriptors, reference.descriptors)
     distance, limit = np.sqrt(best), np.sqrt(second)
     ratio = np.divide(distance, limit, out=np.ones_like(distance), where=limit > 0)
-    return Matches(np.arange(len(source), dtype=np.intp), nearest, distance, ratio)
+    return Matches(np.arange(len(source), dtype=np.intp), nearest, ratio)
 
 
 def _two_nearest(

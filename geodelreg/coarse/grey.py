@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.errors import NoDataError
-from geodelreg.values.raster import Band, BoolArray, Float32Array
+from geodelreg.values.raster import Band, BoolArray
 
 MAX_SAMPLES = 250_000  # of which the 0.5th percentile is known to 0.014 %
 FULL_SCALE = 255.0  # of 8 bit
@@ -57,18 +57,14 @@ def _stretch_limits(band: Band, low_percent: float, high_percent: float) -> tupl
         )
     low, high = (float(v) for v in np.percentile(sample, (low_percent, high_percent)))
     if not high > low:
-        low, high = _full_range(band.data, band.valid)
+        values = band.data[band.valid]
+        low, high = float(values.min()), float(values.max())
     if not high > low:
         raise NoDataError(
             f"{_name(band)} is constant ({low:g})",
             "Nothing can be matched on it: use another band.",
         )
     return low, high
-
-
-def _full_range(data: Float32Array, valid: BoolArray) -> tuple[float, float]:
-    values = data[valid]
-    return float(values.min()), float(values.max())
 
 
 def _fill_from_nearest(grey: NDArray[np.uint8], valid: BoolArray) -> NDArray[np.uint8]:

@@ -13,9 +13,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from geodelreg.fine.patches import Patches
+from geodelreg.fine.patches import Patches, patch_offsets
 from geodelreg.fine.surface import Surface, sample_patches
-from geodelreg.geo.pixel import pixel_centres
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
 from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray, StatusArray
@@ -121,7 +120,7 @@ def match_patches(
     count = len(patches)
     local = there.linearise(patches.centre)
     bend = _curvature(there, patches) if options.bent else None
-    offsets = _offsets(patches.size)
+    offsets = patch_offsets(np.arange(patches.size + 2 * _MARGIN) - _MARGIN, patches.size)
     move = np.zeros((count, 2))
     last = np.full(count, np.inf)
     covariance = np.full((count, 2, 2), np.inf)
@@ -307,10 +306,3 @@ def _step(
 def _finite(covariance: FloatArray) -> FloatArray:
     good = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     return np.where(good[:, None, None], covariance, np.eye(2) * _UNKNOWN_PX2)
-
-
-def _offsets(size: int) -> FloatArray:
-    """((n + 2)², 2) positions of patch pixels, with a margin, from the centre, in patch pixels."""
-    axis = pixel_centres(np.arange(size + 2 * _MARGIN) - _MARGIN) - size / 2.0
-    grid_x, grid_y = np.meshgrid(axis, axis)
-    return np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geodelreg.geo.pixel import pixel_centres
 from geodelreg.values.raster import Band, BoolArray, Float32Array, FloatArray, Grid, IntArray
 
 
@@ -84,6 +85,19 @@ def cut_patches(bands: list[Band], full: Grid, size: int) -> Patches:
     )
     owner = np.zeros(len(centre), dtype=np.intp)
     return Patches(centre, values, valid, np.array([to_full.a, to_full.e]), size, owner)
+
+
+def patch_offsets(index: IntArray, size: int) -> FloatArray:
+    """(K², 2) places of the pixels with (K,) numbers along either axis, from a patch's centre."""
+    axis = pixel_centres(index) - size / 2.0
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+def centred(values: FloatArray, weight: FloatArray) -> FloatArray:
+    """(..., N) values less their weighted means, times the weights."""
+    total = np.maximum(weight.sum(axis=-1, keepdims=True), 1.0)
+    mean = (values * weight).sum(axis=-1, keepdims=True) / total
+    return np.asarray((values - mean) * weight)
 
 
 def gather(parts: Sequence[Patches]) -> Patches:

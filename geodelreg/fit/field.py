@@ -171,7 +171,7 @@ def tuned(
     first = field_of(points, kernel, weight, jumps)
     extent = float(np.ptp(points.source, axis=0).max())
     columns, apart = first.columns(points.source), distances(points.source, points.source)
-    together = first.correlation > 0 if jumps else None
+    together = first.correlation(points.source, points.source) > 0 if jumps else None
     move = points.target - points.source
     own = points.covariance[:, (0, 1), (0, 1)]
 

@@ -25,32 +25,10 @@ class InteriorEdges(NamedTuple):
         Points of the edge, the smaller index first.
     opposite : (E, 2) intp
         Third points of the two triangles.
-    triangles : (E, 2) intp
-        The two triangles.
     """
 
     ends: IntArray
     opposite: IntArray
-    triangles: IntArray
-
-
-class Neighbours(NamedTuple):
-    """Neighbours of every point, one after the other.
-
-    Attributes
-    ----------
-    start : (N + 1,) intp
-        Neighbours of point i are ``near[start[i]:start[i + 1]]``.
-    near : (K,) intp
-    """
-
-    start: IntArray
-    near: IntArray
-
-    @property
-    def owner(self) -> IntArray:
-        """(K,) intp, the point that each entry of `near` is a neighbour of."""
-        return np.repeat(np.arange(len(self.start) - 1, dtype=np.intp), np.diff(self.start))
 
 
 class Star(NamedTuple):
@@ -145,16 +123,7 @@ def interior_edges(triangles: IntArray) -> InteriorEdges:
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     same = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
     sides = np.stack([order[same], order[same + 1]], axis=1)
-    return InteriorEdges(ends[sides[:, 0]], triangles.reshape(-1)[sides], sides // 3)
-
-
-def neighbours(triangles: IntArray, count: int) -> Neighbours:
-    """Neighbours of each of `count` points along the edges of the triangles."""
-    edge = edges(triangles)
-    both = np.sort(np.concatenate([edge, edge[:, ::-1]]) @ np.array([count, 1]))
-    owner, near = np.divmod(both, max(count, 1))
-    start = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
-    return Neighbours(start.astype(np.intp), near)
+    return InteriorEdges(ends[sides[:, 0]], triangles.reshape(-1)[sides])
 
 
 def own_stars(triangles: IntArray, count: int) -> Star:
@@ -170,12 +139,13 @@ def own_stars(triangles: IntArray, count: int) -> Star:
     if count <= _FEW_POINTS or len(triangles) == 0:
         target, member = np.nonzero(~np.eye(count, dtype=np.bool_))
         return Star(target, member)
-    near = neighbours(triangles, count)
-    owner = near.owner
-    reach = np.diff(near.start)[near.near]
-    through = np.repeat(near.start[near.near], reach) + running(reach)
-    second = np.repeat(owner, reach) * count + near.near[through]
-    keys = distinct(np.concatenate([owner * count + near.near, second]))
+    edge = edges(triangles)
+    first = np.sort(np.concatenate([edge, edge[:, ::-1]]) @ np.array([count, 1]))
+    owner, near = np.divmod(first, count)
+    degree = np.bincount(owner, minlength=count)
+    reach = degree[near]
+    through = np.repeat((np.cumsum(degree) - degree)[near], reach) + running(reach)
+    keys = distinct(np.concatenate([first, np.repeat(owner, reach) * count + near[through]]))
     target, member = np.divmod(keys, count)
     other = target != member
     return Star(target[other], member[other])

@@ -7,13 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from geodelreg.fine.least_squares import MIN_CORRELATION, least_valid
-from geodelreg.fine.patches import Patches, cut_patches, sample_step
+from geodelreg.fine.patches import Patches, centred, cut_patches, patch_offsets, sample_step
 from geodelreg.fine.surface import Surface, sample
 from geodelreg.fine.texture import noise_of, show_texture
 from geodelreg.fine.tiles import Tile
 from geodelreg.fine.tuning import Tuning, tile_images
 from geodelreg.fit.chance import log10_binomial_tail
-from geodelreg.geo.pixel import pixel_centres
 from geodelreg.pair import Roles
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import Band, BoolArray, FloatArray, IntArray
@@ -130,11 +129,8 @@ def _explained(
     """
     size = patches.size
     picked = np.arange(0, size, 2)
-    axis = pixel_centres(picked) - size / 2.0
-    grid_x, grid_y = np.meshgrid(axis, axis)
-    inside = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
     take = (picked[:, None] * size + picked[None, :]).ravel()
-    spots = (offsets[:, None, :] + inside[None]).reshape(-1, 2) * patches.step
+    spots = (offsets[:, None, :] + patch_offsets(picked, size)[None]).reshape(-1, 2) * patches.step
     # a patch is so small that its local affine puts its pixels where a map that bends does
     local = to_surface.linearise(patches.centre[chosen])
     place = local[:, None, :, 2] + np.einsum("pij,sj->psi", local[:, :, :2], spots)
@@ -144,8 +140,8 @@ def _explained(
     weight = seen.astype(np.float64)[:, :, None]
     values = patches.values[chosen][:, None, :, take]
     alike = bool((seen == seen[:, :1]).all())  # then one basis serves all offsets
-    bands = _centred(values.astype(np.float64), weight[:, :1] if alike else weight)
-    image = _centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
+    bands = centred(values.astype(np.float64), weight[:, :1] if alike else weight)
+    image = centred(there.reshape(shape)[:, :, None].astype(np.float64), weight)
     basis, _ = np.linalg.qr(bands.swapaxes(2, 3))
     explained = (np.matmul(image, basis) ** 2).sum(axis=(2, 3))
     energy = (image**2).sum(axis=(2, 3))
@@ -155,9 +151,3 @@ def _explained(
     good[:, 0] = share[:, 0] > least
     good &= (np.abs(bands).sum(axis=(2, 3)) > 0) & (energy > 0)
     return np.where(good, explained / np.where(good, energy, 1.0), np.nan)
-
-
-def _centred(values: FloatArray, weight: FloatArray) -> FloatArray:
-    total = np.maximum(weight.sum(axis=-1, keepdims=True), 1.0)
-    mean = (values * weight).sum(axis=-1, keepdims=True) / total
-    return np.asarray((values - mean) * weight)

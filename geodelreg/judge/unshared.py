@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from geodelreg.fine.passes import Refinement
-from geodelreg.fine.patches import cut_patches, sample_step
+from geodelreg.fine.patches import centred, cut_patches, patch_offsets, sample_step
 from geodelreg.fine.surface import sample_patches
 from geodelreg.fine.tuning import tile_images
-from geodelreg.geo.pixel import pixel_centres
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
@@ -59,8 +58,7 @@ def unshared_share(refined: Refinement, correction: PixelMap, points: TiePoints)
     tuning = replace(refined.tuning, local_tone=False)  # which would follow what is not shared
     there = part.to_surface(correction)
     every = sample_step([tile.template[0] for tile in refined.tiles], size, _PATCHES)
-    axis = pixel_centres(np.arange(-1, size + 1)) - size / 2.0
-    offsets = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    offsets = patch_offsets(np.arange(-1, size + 1), size)
     left, alike, first = [], [], 0
     for tile in refined.tiles:
         images, surface = tile_images(part, tile, tuning)
@@ -113,14 +111,14 @@ def _unexplained(
         variance; NaN of patches that show nothing.
     """
     weight = usable[:, None].astype(np.float64)
-    total = np.maximum(weight.sum(axis=2, keepdims=True), 1.0)
+    total = np.maximum(weight.sum(axis=(1, 2)), 1.0)
     slopes = (
         image[:, 1:-1, 1:-1],
         image[:, 1:-1, 2:] - image[:, 1:-1, :-2],
         image[:, 2:, 1:-1] - image[:, :-2, 1:-1],
     )
     rows = np.stack([*(v.reshape(len(image), -1) for v in slopes), template[:, 0]], axis=1)
-    rows = (rows - (rows * weight).sum(axis=2, keepdims=True) / total) * weight
+    rows = centred(rows, weight)
     target = rows[:, :1]
     basis, _ = np.linalg.qr(rows[:, 1:].swapaxes(1, 2))
     rest = target - np.matmul(np.matmul(target, basis), basis.swapaxes(1, 2))
@@ -129,7 +127,7 @@ def _unexplained(
     for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         product += (rest[one] * rest[other]).sum(axis=(1, 2))
         pairs += (good[one] & good[other]).sum(axis=(1, 2))
-    variance = (target**2).sum(axis=(1, 2)) / total[:, 0, 0]
+    variance = (target**2).sum(axis=(1, 2)) / total
     variance[variance <= 0] = np.nan
-    left = (rest**2).sum(axis=(1, 2)) / total[:, 0, 0]
+    left = (rest**2).sum(axis=(1, 2)) / total
     return left / variance, product / np.maximum(pairs, 1.0) / variance

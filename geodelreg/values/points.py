@@ -45,15 +45,12 @@ class Matches:
     Attributes
     ----------
     source_index, reference_index : (M,) intp
-    distance : (M,) float64
-        Euclidean distance of the two descriptors.
     ratio : (M,) float64
-        Distance over that of the second nearest reference descriptor.
+        Distance of the two descriptors over that of the second nearest reference descriptor.
     """
 
     source_index: IntArray
     reference_index: IntArray
-    distance: FloatArray
     ratio: FloatArray
 
     def __len__(self) -> int:
@@ -61,12 +58,7 @@ class Matches:
 
     def take(self, keep: BoolArray | IntArray) -> Matches:
         """Some of the matches, by mask or index."""
-        return Matches(
-            self.source_index[keep],
-            self.reference_index[keep],
-            self.distance[keep],
-            self.ratio[keep],
-        )
+        return Matches(self.source_index[keep], self.reference_index[keep], self.ratio[keep])
 
     def xy(self, source: Keypoints, reference: Keypoints) -> tuple[FloatArray, FloatArray]:
         """Positions, (M, 2) float64 each, outer-corner pixels of either image."""

@@ -10,7 +10,6 @@ from geodelreg.geo.triangulation import (
     edges,
     incircle_sine,
     interior_edges,
-    neighbours,
     relative_altitude,
     twice_area,
 )
@@ -40,7 +39,6 @@ def test_nothing_to_triangulate(xy: np.ndarray) -> None:
     assert triangles.shape == (0, 3)
     assert edges(triangles).shape == (0, 2)
     assert len(interior_edges(triangles).ends) == 0
-    assert neighbours(triangles, len(xy)).start.tolist() == [0] * (len(xy) + 1)
     assert relative_altitude(xy, triangles).shape == (0,)
     assert incircle_sine(xy, interior_edges(triangles)).shape == (0,)
 
@@ -62,15 +60,11 @@ def test_order_of_points_does_not_change_the_mesh() -> None:
     assert {frozenset(t) for t in mapped.tolist()} == {frozenset(t) for t in delaunay(xy).tolist()}
 
 
-def test_edges_and_neighbours_of_the_square() -> None:
+def test_edges_of_the_square() -> None:
     triangles = delaunay(SQUARE)
     assert edges(triangles).tolist() == [
         [0, 1], [0, 3], [0, 4], [1, 2], [1, 4], [2, 3], [2, 4], [3, 4],
     ]  # fmt: skip
-    near = neighbours(triangles, 6)
-    lists = [near.near[near.start[i] : near.start[i + 1]].tolist() for i in range(6)]
-    assert lists == [[1, 3, 4], [0, 2, 4], [1, 3, 4], [0, 2, 4], [0, 1, 2, 3], []]
-    assert near.owner.tolist() == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 + [4] * 4
 
 
 def test_interior_edges_of_the_square() -> None:
@@ -80,9 +74,6 @@ def test_interior_edges_of_the_square() -> None:
         for ends, opposite in zip(interior.ends.tolist(), interior.opposite.tolist(), strict=True)
     }
     assert found == {(0, 4): {1, 3}, (1, 4): {0, 2}, (2, 4): {1, 3}, (3, 4): {0, 2}}
-    triangles = delaunay(SQUARE)
-    for ends, pair in zip(interior.ends.tolist(), interior.triangles.tolist(), strict=True):
-        assert all(set(ends) <= set(triangles[t].tolist()) for t in pair)
 
 
 def test_relative_altitude_is_known_for_simple_triangles_and_free_of_scale() -> None:

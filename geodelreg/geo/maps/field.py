@@ -93,7 +93,7 @@ class FieldMap(SmoothMap):
         """(N,) radial standard error at (N, 2) source pixels, in source pixels."""
         out = np.empty(len(xy))
         for some in self._slices(len(xy)):
-            near, columns = self._near(xy[some]), self.columns(xy[some])
+            near, columns = self.correlation(self.source, xy[some]), self.columns(xy[some])
             total = np.zeros(near.shape[1])
             for axis in self.axes:
                 known, lack = axis.unknown(near, columns)
@@ -103,8 +103,8 @@ class FieldMap(SmoothMap):
 
     def joint_covariance(self, xy: FloatArray) -> FloatArray:
         """(2, M, M) covariance of each component between M points, source pixels squared."""
-        near, columns = self._near(xy), self.columns(xy)
-        prior = self._between(xy, xy)
+        near, columns = self.correlation(self.source, xy), self.columns(xy)
+        prior = self.correlation(xy, xy)
         parts = []
         for axis in self.axes:
             known, lack = axis.unknown(near, columns)
@@ -172,7 +172,8 @@ class FieldMap(SmoothMap):
     @cached_property
     def axes(self) -> tuple[Axis, Axis]:
         """The equations of columns and rows, solved."""
-        columns, correlation = self.columns(self.source), self.correlation
+        columns = self.columns(self.source)
+        correlation = self.correlation(self.source, self.source)
         one, other = (
             solve_axis(
                 columns,
@@ -184,11 +185,6 @@ class FieldMap(SmoothMap):
             for axis in (0, 1)
         )
         return one, other
-
-    @property
-    def correlation(self) -> FloatArray:
-        """(N, N) of the residual between the points."""
-        return self._between(self.source, self.source)
 
     def columns(self, xy: FloatArray) -> FloatArray:
         """(M, 3 + J) trend: an affine, and a step at every jump."""
@@ -251,10 +247,7 @@ class FieldMap(SmoothMap):
         step = max(_AT_ONCE // len(self.source), 1)
         return [slice(start, start + step) for start in range(0, count, step)]
 
-    def _near(self, xy: FloatArray) -> FloatArray:
-        return self._between(self.source, xy)
-
-    def _between(self, one: FloatArray, other: FloatArray) -> FloatArray:
+    def correlation(self, one: FloatArray, other: FloatArray) -> FloatArray:
         """(N, M) correlation of the residual between places, none across a jump."""
         found = self.kernel.correlation(distances(one, other))
         if self.jumps:
