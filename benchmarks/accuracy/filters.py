@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.report import machine, replace_section
 from geodelreg.fit.consensus import consensus
 from geodelreg.fit.delaunay_mesh import filter_matches, star_filter
-from geodelreg.paper.zhang2013 import initial_status, reject_unshared
+from geodelreg.paper.zhang2013 import Pairs, initial_status, reject_unshared
 from geodelreg.values.points import Status
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
@@ -87,7 +87,7 @@ def by_star(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> Boo
 
 def by_shared_edges(source: FloatArray, reference: FloatArray, ratio: FloatArray) -> BoolArray:
     """Edges that both triangulations share: our reading of step 6 of Zhang et al. 2013, once."""
-    status = reject_unshared(source, reference, ratio, initial_status(ratio), 0.2)
+    status = reject_unshared(Pairs(source, reference, ratio), initial_status(ratio), 0.2)
     return np.asarray(status == Status.KEPT)
 
 

@@ -35,7 +35,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, make_pair, roles
 from geodelreg.paper.baseline import grey_keypoints, least_squares, paper_scopes
 from geodelreg.paper.zhang2013 import (
-    StatusArray,
+    Pairs,
     ZhangOptions,
     initial_status,
     reject_ambiguous,
@@ -46,14 +46,14 @@ from geodelreg.paper.zhang2013 import (
 )
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Overview, Status
-from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
+from geodelreg.values.raster import BoolArray, FloatArray, StatusArray, WindowReader
 
 LOOSE_PX = 8.0
 """Tolerance of the consensus before the mesh: noise and distortion together."""
 RIGHT_PX = 1.0
 """A match is right within this many coarser pixels of the truth: three standard deviations of a
 SIFT position, and less than a cloud's parallax in the scenes."""
-Step = Callable[[FloatArray, FloatArray, FloatArray, StatusArray], StatusArray]
+Step = Callable[[Pairs, StatusArray], StatusArray]
 PAPER = ZhangOptions()
 STEPS: dict[str, Step] = {
     "3 one-to-one": reject_duplicates,
@@ -214,12 +214,12 @@ def run_steps(matched: Matched, names: Sequence[str]) -> tuple[StatusArray, dict
     counts : dict of str to int
         Points left after each step.
     """
-    points = (matched.source_xy, matched.reference_xy, matched.ratio)
-    status = reject_ambiguous(*points, initial_status(matched.ratio), PAPER.ratio)
+    pairs = Pairs(matched.source_xy, matched.reference_xy, matched.ratio)
+    status = reject_ambiguous(pairs, initial_status(matched.ratio), PAPER.ratio)
     counts = {"2 ratio": int((status == Status.KEPT).sum())}
     for name, step in STEPS.items():
         if name in names:
-            status = step(*points, status)
+            status = step(pairs, status)
             counts[name] = int((status == Status.KEPT).sum())
     return status, counts
 

@@ -7,6 +7,7 @@ import numpy as np
 from geodelreg.values.points import Keypoints, Matches
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray, IntArray
 
+_PLACE_PX = 0.5  # as far apart repeated matches of one pair of places are, at most
 BLOCK_ROWS = 1024  # of 8000 columns: 32 MB at a time
 
 
@@ -70,21 +71,18 @@ def ratio_test(ratio: FloatArray, limit: float) -> BoolArray:
     return np.asarray(ratio < limit)
 
 
-def one_to_one(
-    source_xy: FloatArray, reference_xy: FloatArray, ratio: FloatArray, tolerance_px: float = 0.5
-) -> BoolArray:
+def one_to_one(source_xy: FloatArray, reference_xy: FloatArray, ratio: FloatArray) -> BoolArray:
     """Make matches one-to-one by their pixel coordinates.
 
     SIFT gives one place several orientations and nearly equal scales, so one pair of places can
     match repeatedly.  Matches are visited from the best ratio on; one goes when its place, in
-    either image, is taken.  A place is a cell of a lattice of `tolerance_px`.
+    either image, is taken.  A place is a cell of a lattice of half a pixel.
 
     Parameters
     ----------
     source_xy, reference_xy : (M, 2) float64
         Outer-corner pixels.
     ratio : (M,) float64
-    tolerance_px : float
 
     Returns
     -------
@@ -93,8 +91,8 @@ def one_to_one(
     """
     keep = np.zeros(len(ratio), dtype=np.bool_)
     order = np.argsort(ratio, kind="stable")
-    source_place = _places(source_xy, tolerance_px)
-    reference_place = _places(reference_xy, tolerance_px)
+    source_place = _places(source_xy)
+    reference_place = _places(reference_xy)
     source_taken = np.zeros(len(ratio), dtype=np.bool_)
     reference_taken = np.zeros(len(ratio), dtype=np.bool_)
     for i in order:
@@ -104,10 +102,10 @@ def one_to_one(
     return keep
 
 
-def _places(xy: FloatArray, tolerance_px: float) -> IntArray:
+def _places(xy: FloatArray) -> IntArray:
     """Number of the place of each point."""
     if len(xy) == 0:
         return np.empty(0, dtype=np.intp)
-    cell = np.floor(xy / tolerance_px).astype(np.int64)
+    cell = np.floor(xy / _PLACE_PX).astype(np.int64)
     _, place = np.unique(cell, axis=0, return_inverse=True)
     return np.asarray(place.reshape(-1), dtype=np.intp)

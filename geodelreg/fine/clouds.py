@@ -82,7 +82,7 @@ def cloud_look(xy: FloatArray, moves: BoolArray, brightest: FloatArray) -> Cloud
     return CloudLook(among, *signed_ranks(brighter))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class HeightParallax:
     """Whether motion against PAN goes with motion between two MS bands.
 
@@ -94,14 +94,11 @@ class HeightParallax:
     ----------
     explained : float
         Share of the variance of the motion that the bands' difference explains (r²).
-    ground : (N,) bool
-        Patches where the two bands agree to within their errors.
     share : float
-        Of the patches seen in both bands, those where they do not.
+        Of the patches seen in both bands, those where the two do not agree to within their errors.
     """
 
-    explained: float
-    ground: BoolArray
+    explained: float = 0.0
     share: float = 0.0
 
     @property
@@ -126,15 +123,14 @@ def height_parallax(
         Radial standard error of the difference.
     """
     both = np.isfinite(move).all(axis=1) & np.isfinite(difference).all(axis=1)
-    ground = np.zeros(len(move), dtype=bool)
     if both.sum() < _FEWEST:
-        return HeightParallax(0.0, ground)
+        return HeightParallax()
     one, other = _along(move[both]), _along(difference[both])
     spread = one.std() * other.std()
     r = float(((one - one.mean()) * (other - other.mean())).mean() / spread) if spread > 0 else 0.0
     apart = np.hypot(*difference[both].T)
-    ground[both] = apart <= _NO_PARALLAX_SIGMAS * sigma_px[both]
-    return HeightParallax(r * r, ground, float(1.0 - ground[both].mean()))
+    agree = apart <= _NO_PARALLAX_SIGMAS * sigma_px[both]
+    return HeightParallax(r * r, float(1.0 - agree.mean()))
 
 
 def _along(values: FloatArray) -> FloatArray:

@@ -96,10 +96,10 @@ def neighbours(xy: FloatArray) -> IntArray:
     if len(xy) < 4:
         return np.empty((0, 2), dtype=np.intp)
     try:
-        triangle = Delaunay(xy, qhull_options="QJ Pp").simplices
+        triangle = Delaunay(xy, qhull_options="QJ Pp").simplices.astype(np.intp)
     except QhullError:
         return np.empty((0, 2), dtype=np.intp)
-    return edges(triangle[relative_altitude(xy, triangle) > _SLIVER].astype(np.intp))
+    return edges(triangle[relative_altitude(xy, triangle) > _SLIVER])
 
 
 def _smooth(xy: FloatArray, move: FloatArray, sigma_px: FloatArray, pairs: IntArray) -> BoolArray:

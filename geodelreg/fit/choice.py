@@ -79,7 +79,7 @@ def held_out(points: Observations, estimate: Estimate) -> FloatArray:
 
 def _precision(points: Observations, estimate: Estimate) -> FloatArray:
     """(N, 2, 2) inverse covariances, with the variance that all points have besides their own."""
-    return np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2))
+    return np.asarray(np.linalg.inv(points.covariance + estimate.extra_variance_px2 * np.eye(2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +167,8 @@ def select_model(
 
     def distance2(error: FloatArray) -> FloatArray:
         """Squared, in variances; capped, so that one outlier does not decide."""
-        return np.minimum(np.einsum("ni,nij,nj->n", error, precision, error), REJECT_D2)
+        squared = np.einsum("ni,nij,nj->n", error, precision, error)
+        return np.asarray(np.minimum(squared, REJECT_D2))
 
     blocks = spatial_blocks(points.source)
     for name in candidates[:-1]:

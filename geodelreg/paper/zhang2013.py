@@ -2,7 +2,7 @@
 
 Yongmei Zhang, Li Ma, Rui Zhang, "A Quick Image Registration Algorithm Based on Delaunay
 Triangulation", TELKOMNIKA 11(2), 2013, 761–773.  Each numbered step of section 2 there is one
-function over ``(source_xy, reference_xy, ratio, status)``.  A step returns a new status array:
+function over `Pairs` and a status.  A step returns a new status array:
 points are never dropped, and only kept ones are looked at.  Step 1 is
 `geodelreg.coarse.keypoints.detect` with `lowe_options`, step 7 plain least squares.
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,25 @@ LOWE_CONTRAST = 0.03
 
 _ONE_CELL = 10**9
 """Keypoints to a cell of the grid that spreads them: so many that the image is one cell."""
+
+
+_Step = Callable[["Pairs", StatusArray], StatusArray]
+
+
+class Pairs(NamedTuple):
+    """What the steps look at.
+
+    Attributes
+    ----------
+    source_xy, reference_xy : (M, 2) float64
+        Outer-corner pixels of either image.
+    ratio : (M,) float64
+        Nearest over second nearest descriptor distance.
+    """
+
+    source_xy: FloatArray
+    reference_xy: FloatArray
+    ratio: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +128,7 @@ def match_zhang2013(
         Matches left after each step, in order.
     """
     options = options or ZhangOptions()
-    steps = {
+    steps: dict[str, _Step] = {
         "ratio": partial(reject_ambiguous, limit=options.ratio),
         "one_to_one": reject_duplicates,
         "not_collinear": partial(reject_collinear, min_altitude=options.min_altitude),
@@ -127,31 +147,31 @@ def match_sift(
     Parameters and results as for `match_zhang2013`.
     """
     options = options or ZhangOptions()
-    steps = {"ratio": partial(reject_ambiguous, limit=options.ratio)}
+    steps: dict[str, _Step] = {"ratio": partial(reject_ambiguous, limit=options.ratio)}
     return _after(steps, source, reference, options.sigma_px)
 
 
 def _after(
-    steps: Mapping[str, Callable[..., StatusArray]],
+    steps: Mapping[str, _Step],
     source: Keypoints,
     reference: Keypoints,
     sigma_px: float,
 ) -> tuple[TiePoints, dict[str, int]]:
     """Nearest neighbours, and what each of the steps leaves of them."""
     matches = match_descriptors(source, reference)
-    (source_xy, reference_xy), ratio = matches.xy(source, reference), matches.ratio
-    status = initial_status(ratio)
+    pairs = Pairs(*matches.xy(source, reference), matches.ratio)
+    status = initial_status(pairs.ratio)
     counts = {"nearest": _kept(status)}
     for name, step in steps.items():
-        status = step(source_xy, reference_xy, ratio, status)
+        status = step(pairs, status)
         counts[name] = _kept(status)
     points = TiePoints(
-        source_px=source_xy,
-        reference_px=reference_xy,
-        covariance_px2=np.tile(sigma_px**2 * np.eye(2), (len(ratio), 1, 1)),
-        score=1.0 - ratio,
+        source_px=pairs.source_xy,
+        reference_px=pairs.reference_xy,
+        covariance_px2=np.tile(sigma_px**2 * np.eye(2), (len(status), 1, 1)),
+        score=1.0 - pairs.ratio,
         status=status,
-        residual_px=np.full((len(ratio), 2), np.nan),
+        residual_px=np.full((len(status), 2), np.nan),
     )
     return points, counts
 
@@ -161,21 +181,12 @@ def initial_status(ratio: FloatArray) -> StatusArray:
     return np.full(len(ratio), Status.KEPT, dtype=np.uint8)
 
 
-def reject_ambiguous(
-    source_xy: FloatArray,
-    reference_xy: FloatArray,
-    ratio: FloatArray,
-    status: StatusArray,
-    limit: float,
-) -> StatusArray:
+def reject_ambiguous(pairs: Pairs, status: StatusArray, limit: float) -> StatusArray:
     """Step 2, and again in our reading of step 6: the ratio test of Lowe 2004.
 
     Parameters
     ----------
-    source_xy, reference_xy : (M, 2) float64
-        Outer-corner pixels.
-    ratio : (M,) float64
-        Nearest over second nearest descriptor distance.
+    pairs : Pairs
     status : (M,) uint8
     limit : float
         Kept matches with a ratio of `limit` or more become `Status.RATIO`; 1 and more keep all.
@@ -184,20 +195,18 @@ def reject_ambiguous(
     -------
     (M,) uint8
     """
-    ambiguous = np.zeros(len(ratio), np.bool_) if limit >= 1 else ~ratio_test(ratio, limit)
+    ambiguous = np.zeros(len(status), np.bool_) if limit >= 1 else ~ratio_test(pairs.ratio, limit)
     return _rejected(status, ambiguous, Status.RATIO)
 
 
-def reject_duplicates(
-    source_xy: FloatArray, reference_xy: FloatArray, ratio: FloatArray, status: StatusArray
-) -> StatusArray:
+def reject_duplicates(pairs: Pairs, status: StatusArray) -> StatusArray:
     """Step 3: matches become one-to-one by pixel coordinates; the best ratio stays.
 
     Parameters and result as for `reject_ambiguous`; the others become `Status.DUPLICATE`.
     """
     kept = np.flatnonzero(status == Status.KEPT)
     duplicate = np.zeros(len(status), dtype=np.bool_)
-    duplicate[kept] = ~one_to_one(source_xy[kept], reference_xy[kept], ratio[kept])
+    duplicate[kept] = ~one_to_one(*(part[kept] for part in pairs))
     return _rejected(status, duplicate, Status.DUPLICATE)
 
 
@@ -218,13 +227,7 @@ def triangulate_kept(xy: FloatArray, status: StatusArray) -> IntArray:
     return kept[delaunay(xy[kept])]
 
 
-def reject_collinear(
-    source_xy: FloatArray,
-    reference_xy: FloatArray,
-    ratio: FloatArray,
-    status: StatusArray,
-    min_altitude: float,
-) -> StatusArray:
+def reject_collinear(pairs: Pairs, status: StatusArray, min_altitude: float) -> StatusArray:
     """Step 5, first half: points that make three points collinear, in either triangulation.
 
     Of each flat triangle, from the flattest on, the corner of the worst descriptor ratio becomes
@@ -233,21 +236,17 @@ def reject_collinear(
     Parameters and result as for `reject_ambiguous`; `min_altitude` as in `ZhangOptions`.
     """
     groups, measures = [], []
-    for xy in (source_xy, reference_xy):
+    for xy in (pairs.source_xy, pairs.reference_xy):
         triangles = triangulate_kept(xy, status)
         groups.append(triangles)
         measures.append(relative_altitude(xy, triangles))
-    gone = _worst_of_groups(np.concatenate(groups), np.concatenate(measures), min_altitude, ratio)
+    gone = _worst_of_groups(
+        np.concatenate(groups), np.concatenate(measures), min_altitude, pairs.ratio
+    )
     return _rejected(status, gone, Status.COLLINEAR)
 
 
-def reject_cocircular(
-    source_xy: FloatArray,
-    reference_xy: FloatArray,
-    ratio: FloatArray,
-    status: StatusArray,
-    min_incircle: float,
-) -> StatusArray:
+def reject_cocircular(pairs: Pairs, status: StatusArray, min_incircle: float) -> StatusArray:
     """Step 5, second half: points that make four points cocircular, in either triangulation.
 
     Of each such quadrilateral, from the most ambiguous on, the corner of the worst descriptor
@@ -256,21 +255,17 @@ def reject_cocircular(
     Parameters and result as for `reject_ambiguous`; `min_incircle` as in `ZhangOptions`.
     """
     groups, measures = [], []
-    for xy in (source_xy, reference_xy):
+    for xy in (pairs.source_xy, pairs.reference_xy):
         interior = interior_edges(triangulate_kept(xy, status))
         groups.append(np.concatenate([interior.ends, interior.opposite], axis=1))
         measures.append(incircle_sine(xy, interior))
-    gone = _worst_of_groups(np.concatenate(groups), np.concatenate(measures), min_incircle, ratio)
+    gone = _worst_of_groups(
+        np.concatenate(groups), np.concatenate(measures), min_incircle, pairs.ratio
+    )
     return _rejected(status, gone, Status.COCIRCULAR)
 
 
-def reject_unshared(
-    source_xy: FloatArray,
-    reference_xy: FloatArray,
-    ratio: FloatArray,
-    status: StatusArray,
-    min_shared_edges: float,
-) -> StatusArray:
+def reject_unshared(pairs: Pairs, status: StatusArray, min_shared_edges: float) -> StatusArray:
     """Step 6, our reading: points whose edges the triangulations do not share: `Status.TOPOLOGY`.
 
     A homologous pair has the same neighbours in both triangulations, but for neighbours that are
@@ -279,8 +274,8 @@ def reject_unshared(
     Parameters and result as for `reject_ambiguous`; `min_shared_edges` as in `ZhangOptions`.
     """
     count = len(status)
-    source_edges = _edge_keys(triangulate_kept(source_xy, status), count)
-    reference_edges = _edge_keys(triangulate_kept(reference_xy, status), count)
+    source_edges = _edge_keys(triangulate_kept(pairs.source_xy, status), count)
+    reference_edges = _edge_keys(triangulate_kept(pairs.reference_xy, status), count)
     shared = _edges_per_point(np.intersect1d(source_edges, reference_edges), count)
     either = _edges_per_point(np.union1d(source_edges, reference_edges), count)
     unshared = (status == Status.KEPT) & (shared < min_shared_edges * either)

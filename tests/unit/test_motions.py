@@ -180,7 +180,7 @@ def test_height_shows_in_the_bands_and_what_does_not_differ_is_ground() -> None:
     difference = noisy(1.4 * height[:, None] * direction, rng, 0.1)
     found = height_parallax(move, difference, sigma)
     assert found.explains
-    assert (found.ground == (height == 0)).mean() > 0.95
+    assert found.share == pytest.approx((height > 0).mean(), abs=0.05)
 
 
 def test_bands_that_move_together_over_a_bent_ground_say_nothing_of_height() -> None:

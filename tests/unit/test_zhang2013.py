@@ -12,6 +12,7 @@ from geodelreg.coarse.keypoints import detect
 from geodelreg.geo.triangulation import incircle_sine, interior_edges, relative_altitude
 from geodelreg.paper.zhang2013 import (
     AS_PRINTED,
+    Pairs,
     ZhangOptions,
     initial_status,
     lowe_options,
@@ -40,7 +41,7 @@ def homologous(count: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArra
 def test_ratio_step_rejects_at_the_limit_and_above() -> None:
     source, reference, _ = homologous(4, 1)
     ratio = np.array([0.5, 0.79, 0.8, 0.95])
-    status = reject_ambiguous(source, reference, ratio, initial_status(ratio), 0.8)
+    status = reject_ambiguous(Pairs(source, reference, ratio), initial_status(ratio), 0.8)
     assert status.tolist() == [Status.KEPT, Status.KEPT, Status.RATIO, Status.RATIO]
 
 
@@ -50,7 +51,7 @@ def test_duplicates_step_leaves_one_to_one_matches_and_looks_at_kept_ones_only()
     ratio = np.array([0.6, 0.5, 0.4, 0.3, 0.7])
     status = initial_status(ratio)
     status[3] = Status.RATIO
-    after = reject_duplicates(source, reference, ratio, status)
+    after = reject_duplicates(Pairs(source, reference, ratio), status)
     assert after.tolist() == [Status.DUPLICATE, Status.KEPT, Status.KEPT, Status.RATIO, 0]
 
 
@@ -60,14 +61,14 @@ def test_collinear_step_drops_the_worst_ratio_of_a_flat_triangle(in_source: bool
     round_ = np.array([[0.0, 0], [50, 30], [100, 0], [50, 80]])
     ratio = np.array([0.5, 0.4, 0.7, 0.75])
     source, reference = (flat, round_) if in_source else (round_, flat)
-    status = reject_collinear(source, reference, ratio, initial_status(ratio), 0.02)
+    status = reject_collinear(Pairs(source, reference, ratio), initial_status(ratio), 0.02)
     assert status.tolist() == [0, 0, Status.COLLINEAR, 0]
 
 
 def test_cocircular_step_drops_the_worst_ratio_of_a_square() -> None:
     square = np.array([[0.0, 0], [10, 0], [10, 10], [0, 10]])
     ratio = np.array([0.5, 0.7, 0.6, 0.4])
-    status = reject_cocircular(square, square, ratio, initial_status(ratio), 0.01)
+    status = reject_cocircular(Pairs(square, square, ratio), initial_status(ratio), 0.01)
     assert status.tolist() == [0, Status.COCIRCULAR, 0, 0]
 
 
@@ -79,15 +80,15 @@ def test_degeneracy_steps_leave_no_group_whole() -> None:
     quads = np.concatenate([before.ends, before.opposite], axis=1)
     degenerate = incircle_sine(lattice, before) < 0.01
     assert degenerate.sum() > 100
-    after = reject_cocircular(lattice, lattice, ratio, status, 0.01)
+    after = reject_cocircular(Pairs(lattice, lattice, ratio), status, 0.01)
     assert (after[quads[degenerate]] != Status.KEPT).any(axis=1).all()
 
 
 def test_tolerances_are_free_of_scale() -> None:
     source, reference, ratio = homologous(300, 3)
     for step, limit in ((reject_collinear, 0.03), (reject_cocircular, 0.03)):
-        first = step(source, reference, ratio, initial_status(ratio), limit)
-        scaled = step(1000 * source, 1000 * reference, ratio, initial_status(ratio), limit)
+        first = step(Pairs(source, reference, ratio), initial_status(ratio), limit)
+        scaled = step(Pairs(1000 * source, 1000 * reference, ratio), initial_status(ratio), limit)
         assert (first != Status.KEPT).any()
         assert (first == scaled).all()
 
@@ -105,7 +106,7 @@ def test_correspondence_step_rejects_displaced_points_and_keeps_homologous_ones(
     source, reference, ratio = homologous(200, 5)
     wrong = np.arange(200) % 10 == 0
     reference[wrong] = np.random.default_rng(6).uniform(0, 1000, (20, 2))
-    status = reject_unshared(source, reference, ratio, initial_status(ratio), 0.2)
+    status = reject_unshared(Pairs(source, reference, ratio), initial_status(ratio), 0.2)
     assert (status[wrong] == Status.TOPOLOGY).sum() >= 17
     assert (status[~wrong] == Status.KEPT).mean() > 0.95
 
@@ -114,15 +115,15 @@ def test_correspondence_step_does_not_mind_translation_rotation_or_scale() -> No
     source, _, ratio = homologous(200, 7)
     c, s = math.cos(2.0), math.sin(2.0)
     reference = 1.7 * source @ np.array([[c, s], [-s, c]]) + 300
-    assert (reject_unshared(source, reference, ratio, initial_status(ratio), 1.0) == 0).all()
+    assert (reject_unshared(Pairs(source, reference, ratio), initial_status(ratio), 1.0) == 0).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_few_points_pass_through_every_step(count: int) -> None:
     source, reference, ratio = homologous(count, 8)
-    status = reject_duplicates(source, reference, ratio, initial_status(ratio))
+    status = reject_duplicates(Pairs(source, reference, ratio), initial_status(ratio))
     for step in (reject_collinear, reject_cocircular, reject_unshared):
-        status = step(source, reference, ratio, status, 0.01)
+        status = step(Pairs(source, reference, ratio), status, 0.01)
     assert status.tolist() == [0] * count
 
 
