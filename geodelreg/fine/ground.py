@@ -31,8 +31,6 @@ class Ground:
 
     Attributes
     ----------
-    member : (N,) bool
-        Patches of the ground: the largest layer, bent as it may be.
     label : (N,) intp
         Layers as `geodelreg.fine.motions.layers` numbers them.
     look : CloudLook
@@ -42,10 +40,14 @@ class Ground:
         Their share.
     """
 
-    member: BoolArray
     label: IntArray
     look: CloudLook
     moving: float
+
+    @property
+    def member(self) -> BoolArray:
+        """(N,) True of the ground's patches: the largest layer, bent as it may be."""
+        return np.asarray(self.label == 0)
 
 
 def find_ground(
@@ -72,19 +74,18 @@ def find_ground(
     for still in (core, np.hypot(*(target - source).T) <= tolerance):
         if not look.explains:
             look, moving = cloud_look(source, ~still, brightest), float((~still).mean())
-    label = layers(source, target - source, np.sqrt(variance_px2))
-    return Ground(label == 0, label, look, moving)
+    return Ground(layers(source, target - source, np.sqrt(variance_px2)), look, moving)
 
 
-def other_motions(
+def other_motion(
     source: FloatArray,
     move: FloatArray,
     label: IntArray,
     brightest: FloatArray,
     textured: int,
     reach_px: float,
-) -> list[Motion]:
-    """Motions besides the ground's that so many patches share that no result may ignore them.
+) -> Motion | None:
+    """The largest motion besides the ground's, if so many share it that no result may ignore it.
 
     Strips one patch wide are no layer, for most of their neighbours are the ground's; they count
     when they agree, and no other patches lie among them.
@@ -105,8 +106,7 @@ def other_motions(
 
     Returns
     -------
-    list of Motion
-        The largest first.
+    Motion or None
     """
     least = max(LEAST_SHARE * textured, LEAST_PATCHES)
     found = []
@@ -126,4 +126,4 @@ def other_motions(
         and is_solid(source, strip.member, label == 0)
     ):
         found.append(strip)
-    return sorted(found, key=lambda motion: -int(motion.member.sum()))
+    return max(found, key=lambda motion: int(motion.member.sum()), default=None)

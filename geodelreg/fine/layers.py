@@ -28,6 +28,7 @@ from geodelreg.values.raster import Band, BoolArray, FloatArray, StatusArray
 
 ELSEWHERE = (Status.CONSENSUS, Status.STAR, Status.RESIDUAL)
 """Patches that matched, but at another place than the correction says."""
+MATCHED = (Status.KEPT, *ELSEWHERE)
 LOCAL_RMS_PX = 0.3
 """Smooth distortion left by an affine that calls for a local warp, PAN pixels."""
 
@@ -262,7 +263,7 @@ def nothing_moves(everything: Pass, unit: float) -> bool:
     """
     if everything.estimate is None:
         return False
-    matched = np.isin(everything.status, (Status.KEPT, *ELSEWHERE))
+    matched = np.isin(everything.status, MATCHED)
     textured = int((everything.status != Status.TEXTURE).sum())
     if not matched.sum() > CALM_PATCHES * textured:
         return False

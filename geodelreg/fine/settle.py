@@ -58,7 +58,6 @@ class Settled:
         Those that `fit` was given.
     refined : Refinement
         With the tiles, the tuning and the size of the patches.
-    passes : int
     """
 
     fit: FieldFit
@@ -66,7 +65,6 @@ class Settled:
     points: Observations
     ground: IntArray
     refined: Refinement
-    passes: int
 
     @property
     def status(self) -> StatusArray:
@@ -163,7 +161,7 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
         else:
             fit = fit_field(some, kernel, settled.fit.field.jumps)
         there = replace(refined, tuning=tuning, size=size)
-        settled = Settled(fit, matched, points, ground, there, number)
+        settled = Settled(fit, matched, points, ground, there)
         before, moved = moved, _rms(fit.field.forward(some.source) - current.forward(some.source))
         current, kernel = fit.field, fit.field.kernel
         # what is left shrinks from pass to pass as it did before the last one

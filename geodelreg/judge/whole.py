@@ -9,8 +9,8 @@ import numpy as np
 from affine import Affine
 
 from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
-from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motions
-from geodelreg.fine.layers import CALM_PATCHES, ELSEWHERE
+from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motion
+from geodelreg.fine.layers import CALM_PATCHES, MATCHED
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
 from geodelreg.fine.motions import LEAST_PATCHES, largest_layer
@@ -296,7 +296,7 @@ def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
 
 def _moves(status: StatusArray, points: Observations, correction: PixelMap) -> FloatArray:
     """(P, 2) of patches that matched, MS pixels; NaN of the others."""
-    matched = np.isin(status, (Status.KEPT, *ELSEWHERE))
+    matched = np.isin(status, MATCHED)
     matched &= np.isfinite(points.covariance).all(axis=(1, 2))
     return np.where(matched[:, None], points.target - correction.forward(points.source), np.nan)
 
@@ -316,10 +316,9 @@ def _other_motion(
     apart = move - np.median(move[ground.member], axis=0)
     textured = int(places.textured.sum())
     bright = places.brightest[index]
-    motions = other_motions(at, apart, ground.label, bright, textured, REACH_PX)
-    if not motions:
+    motion = other_motion(at, apart, ground.label, bright, textured, REACH_PX)
+    if motion is None:
         return 0.0, ""
-    motion = motions[0]
     share = float(motion.member.sum()) / textured
     size = places.centre.max(axis=0) + places.centre.min(axis=0)
     step = motion.move * _unit(to_full) * part.pan_px_per_patch_px / part.step
@@ -335,7 +334,7 @@ def _bent(
     And whether nearly all of them agree on it, and it bends gently.
     """
     pair, last = refined.part.pair, refined.last
-    matched = np.flatnonzero(np.isin(last.status, (Status.KEPT, *ELSEWHERE)))
+    matched = np.flatnonzero(np.isin(last.status, MATCHED))
     points = last.points.take(matched)
     if far is not None:
         points = Observations(
