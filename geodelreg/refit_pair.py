@@ -34,7 +34,7 @@ from geodelreg.judge.words import warnings_of
 from geodelreg.options import FOLLOWING, AlignOptions
 from geodelreg.pair import LATTICE, Pair, Progress, make_pair, roles
 from geodelreg.values.points import FitForm, GivenPoints, Status, TiePoints
-from geodelreg.values.raster import BoolArray, FloatArray, WindowReader
+from geodelreg.values.raster import BoolArray, FloatArray, IntArray, WindowReader
 from geodelreg.values.result import Solution
 from geodelreg.values.timings import Timings
 
@@ -90,7 +90,7 @@ def refit_pair(
     pair = make_pair(source, reference or source, options, timings)
     report(0.1, "reading points")
     _check_places(pair, given, snap, with_pan=reference is not None)
-    by_hand = given.enabled & ~np.isfinite(given.covariance_px2).all(axis=(1, 2))
+    by_hand = given.enabled & given.by_hand
     notes: list[str] = []
     if snap and by_hand.any():
         report(0.2, "measuring")
@@ -113,13 +113,12 @@ def _check_places(pair: Pair, given: GivenPoints, snap: bool, *, with_pan: bool)
     on = np.flatnonzero(given.enabled)
     if not len(on):
         raise PointsError(f"{given.file} has no enabled point", "Enable or add some.")
-    drawn = on[~np.isfinite(given.source_px[on]).all(axis=1)]
+    drawn, placed = on[~given.placed[on]], on[given.placed[on]]
     if len(drawn) and not snap:
         raise PointsError(
             f"{given.file}: point {given.ids[drawn[0]]} lacks the pixel of MS, row and col",
             "Fill it in, or let it be looked for, with PAN and `snap=True`.",
         )
-    placed = np.setdiff1d(on, drawn)
     at = given.source_px[placed]
     twice = cKDTree(at).query_pairs(_SAME_PX) if len(at) else set()
     if twice:
@@ -154,9 +153,8 @@ def _observations(pair: Pair, given: GivenPoints) -> tuple[Observations, BoolArr
     """Enabled points whose pixel is known; what is placed by hand counts as far as an eye sees."""
     # what a fit found too far has the little weight that it had, until someone says otherwise
     far = (given.status == Status.RESIDUAL) & np.isfinite(given.weight)
-    used = (given.enabled | far) & np.isfinite(given.source_px).all(axis=1)
-    covariance = given.covariance_px2[used]
-    unknown = ~np.isfinite(covariance).all(axis=(1, 2))
+    used = (given.enabled | far) & given.placed
+    covariance, unknown = given.covariance_px2[used], given.by_hand[used]
     sigma_px = _LEAST_PX
     if not unknown.all():
         sigma_px = _BY_EYE_PX * max(1.0, 1.0 / pair.pan_px_per_source_px)
@@ -202,28 +200,27 @@ def _fit(
     Points keep the weights that they have from that fit, unless they were edited.
     """
     model = form.model if form else pair.options.model
-    weight = given.weight[used]
-    selection = (
-        select_one(model, points, Frame.of(pair), form.spread_px2, weight)
-        if form and model not in FOLLOWING
-        else select_for(pair, points)
-    )
+    weight, frame = given.weight[used], Frame.of(pair)
     if model == "field":
         if form:
             kernel = Kernel(form.range_px, form.variance_px2, form.spread_px2)
             fit = fit_again(points, kernel, weight, form.jump_rows)
         else:
             fit = cut_at_jumps(points, fit_field(points))
-        selection = selection_of(fit.field, fit.distance2[fit.inlier], Frame.of(pair))
+        selection = selection_of(fit.field, fit.distance2[fit.inlier], frame)
         inlier, judged = fit.inlier, np.full(len(points), np.nan)
         judged[inlier] = fit.weight
     elif model == "tin":
         noise = points.covariance[:, (0, 1), (0, 1)]
         facets = facets_of(points.source, points.target, noise)
-        selection = selection_of(facets, selection.estimate.distance2, Frame.of(pair))
-        inlier = np.ones(len(points), dtype=np.bool_)
-        judged = np.ones(len(points))
+        selection = selection_of(facets, select_for(pair, points).estimate.distance2, frame)
+        inlier, judged = np.ones(len(points), dtype=np.bool_), np.ones(len(points))
     else:
+        selection = (
+            select_one(model, points, frame, form.spread_px2, weight)
+            if form
+            else select_for(pair, points)
+        )
         inlier = selection.estimate.inlier
         judged = student_weight(selection.estimate.distance2)
     lattice = np.concatenate([pair.source_lattice(LATTICE), points.source])
@@ -277,7 +274,7 @@ def _tie_points(pair: Pair, given: GivenPoints, fit: _Fit) -> TiePoints:
     """All points as tie points between MS and PAN, with residuals under the map."""
     reference, covariance = pair.header.carry(given.target_px, given.covariance_px2)
     status = given.status.copy()
-    known = np.isfinite(given.source_px).all(axis=1)
+    known = given.placed
     status[given.enabled] = np.where(fit.used, Status.KEPT, Status.RESIDUAL)[given.enabled]
     status[given.enabled & ~known] = Status.CONVERGENCE
     there = pair.to_reference(fit.selection.estimate.map)
@@ -289,7 +286,7 @@ def _tie_points(pair: Pair, given: GivenPoints, fit: _Fit) -> TiePoints:
 
 
 def _warnings(given: GivenPoints, points: TiePoints, sigma_px: float, with_pan: bool) -> list[str]:
-    unsure = given.enabled & ~np.isfinite(given.covariance_px2).all(axis=(1, 2))
+    unsure = given.enabled & given.by_hand
     notes = []
     if not with_pan:
         notes.append("without PAN, what is called PAN pixels are pixels of MS")
@@ -298,20 +295,20 @@ def _warnings(given: GivenPoints, points: TiePoints, sigma_px: float, with_pan: 
     elif unsure.any():
         by_hand = "1 point was" if unsure.sum() == 1 else f"{unsure.sum()} points were"
         notes.append(
-            f"{by_hand} placed by hand ({_listed(given, unsure)}), which counts as "
+            f"{by_hand} placed by hand ({_listed(given, np.flatnonzero(unsure))}), which counts as "
             f"{_BY_EYE_PX:g} coarser px uncertain"
         )
     far = given.enabled & (points.status == Status.RESIDUAL)
     if far.any():
         lie = "1 enabled point lies" if far.sum() == 1 else f"{far.sum()} enabled points lie"
-        notes.append(f"{lie} far from the fit: {_listed(given, far)}")
+        notes.append(f"{lie} far from the fit: {_listed(given, np.flatnonzero(far))}")
     if sigma_px > _DOUBTFUL_PX:
         notes.append(f"at a corner the correction is uncertain by {sigma_px:.2g} PAN px")
     return notes
 
 
-def _listed(given: GivenPoints, some: BoolArray) -> str:
-    names = [given.ids[index] for index in np.flatnonzero(some)]
+def _listed(given: GivenPoints, some: IntArray) -> str:
+    names = [given.ids[index] for index in some]
     return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
 
 
@@ -342,8 +339,7 @@ def _snapped(pair: Pair, given: GivenPoints, by_hand: BoolArray) -> tuple[GivenP
         given, source_px=source, target_px=target, covariance_px2=covariance, score=score
     )
     notes = [f"{len(hit)} of {len(chosen)} points placed by hand were measured on PAN"]
-    missed = np.zeros(len(given), dtype=np.bool_)
-    missed[chosen[~good]] = True
-    if missed.any():
-        notes[0] += f"; not {_listed(given, missed)}, whose surroundings do not match"
+    if not good.all():
+        missed = _listed(given, chosen[~good])
+        notes[0] += f"; not {missed}, whose surroundings do not match"
     return measured, notes

@@ -200,6 +200,16 @@ class GivenPoints:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def placed(self) -> BoolArray:
+        """(N,) bool, True where the pixel of MS is known."""
+        return np.asarray(np.isfinite(self.source_px).all(axis=1))
+
+    @property
+    def by_hand(self) -> BoolArray:
+        """(N,) bool, True where nothing tells how sure a point is."""
+        return np.asarray(~np.isfinite(self.covariance_px2).all(axis=(1, 2)))
+
 
 @dataclass(frozen=True, slots=True)
 class Gcp:
