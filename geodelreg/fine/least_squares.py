@@ -17,7 +17,7 @@ from geodelreg.fine.patches import Patches, patch_offsets
 from geodelreg.fine.surface import Surface, sample_patches
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Status
-from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray, StatusArray
+from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray, IntArray, StatusArray
 
 ROUGH_STEP = 0.04
 """Tolerance where hundredths of a pixel suffice: the step after such a one is much smaller."""
@@ -189,7 +189,7 @@ def _gauss_newton(
     bend: FloatArray | None,
     offsets: FloatArray,
     move: FloatArray,
-    active: np.ndarray[tuple[int], np.dtype[np.intp]],
+    active: IntArray,
 ) -> _Step:
     """One step for the active patches, from the Gram matrices of image, derivatives, template."""
     n, side = patches.size, patches.size + 2 * _MARGIN
@@ -213,7 +213,11 @@ def _gauss_newton(
     total = _centre(stack, good)
     gram = np.matmul(stack, stack.transpose(0, 2, 1)).astype(np.float64)
     solve = _template_on_image if patches.values.shape[1] == 1 else _image_on_bands
-    return solve(gram, total, good.mean(axis=1))
+    step, covariance, correlation, solvable = solve(gram, total)
+    step[~solvable] = 0.0  # those that cannot be solved stay where they are
+    covariance[~solvable] = np.inf
+    correlation[~solvable] = 0.0
+    return _Step(np.clip(step, -1.0, 1.0), covariance, correlation, good.mean(axis=1))
 
 
 def _centre(stack: Float32Array, good: BoolArray) -> FloatArray:
@@ -232,7 +236,11 @@ def _centre(stack: Float32Array, good: BoolArray) -> FloatArray:
     return np.asarray(total[:, 0, 0], dtype=np.float64)
 
 
-def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
+_Solved = tuple[FloatArray, FloatArray, FloatArray, BoolArray]
+"""(P, 2) steps, (P, 2, 2) covariances, (P,) correlations, and where there are such."""
+
+
+def _template_on_image(gram: FloatArray, total: FloatArray) -> _Solved:
     """Regress the (noisy) template on image and derivatives: (P, 4, 4) image, d/dx, d/dy, template.
 
     The displacement is the derivatives' coefficients over the image's.
@@ -249,16 +257,11 @@ def _template_on_image(gram: FloatArray, total: FloatArray, share: FloatArray) -
     residual = np.maximum(energy - np.einsum("pi,pi->p", solution, right), _ROUNDING * energy)
     variance = residual / np.maximum(total - 4, 1) / gain**2
     together = np.sqrt(np.maximum(gram[:, 0, 0], TINY) * np.maximum(energy, TINY))
-    return _step(
-        solution[:, 1:] / gain[:, None],
-        inverse[:, 1:, 1:] * variance[:, None, None],
-        gram[:, 0, 3] / together,
-        share,
-        solvable,
-    )
+    covariance = inverse[:, 1:, 1:] * variance[:, None, None]
+    return solution[:, 1:] / gain[:, None], covariance, gram[:, 0, 3] / together, solvable
 
 
-def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _Step:
+def _image_on_bands(gram: FloatArray, total: FloatArray) -> _Solved:
     """Regress the image on bands and derivatives: (P, 3 + B, 3 + B) image, d/dx, d/dy, bands.
 
     The bands' weights are the patch's own, so that changed fields may change in their own way.
@@ -272,10 +275,8 @@ def _image_on_bands(gram: FloatArray, total: FloatArray, share: FloatArray) -> _
     by_bands, fine = _inverted(normal[:, 2:, 2:])
     explained = np.einsum("pi,pij,pj->p", right[:, 2:], by_bands, right[:, 2:])
     correlation = np.sqrt(np.clip(explained / np.maximum(energy, TINY), 0, 1))
-    return _step(
-        -solution[:, :2], inverse[:, :2, :2] * variance[:, None, None], correlation, share,
-        solvable & fine,
-    )  # fmt: skip
+    covariance = inverse[:, :2, :2] * variance[:, None, None]
+    return -solution[:, :2], covariance, correlation, solvable & fine
 
 
 def _inverted(normal: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -287,20 +288,6 @@ def _inverted(normal: FloatArray) -> tuple[FloatArray, BoolArray]:
     solvable = np.linalg.det(scaled) > _LEAST_DETERMINANT ** (count / 3)
     scaled[~solvable] = np.eye(count)
     return np.linalg.inv(scaled) / outer, solvable
-
-
-def _step(
-    move: FloatArray,
-    covariance: FloatArray,
-    correlation: FloatArray,
-    share: FloatArray,
-    solvable: BoolArray,
-) -> _Step:
-    """The step, clipped to a pixel, with patches that cannot be solved left where they are."""
-    move[~solvable] = 0.0
-    covariance[~solvable] = np.inf
-    correlation[~solvable] = 0.0
-    return _Step(np.clip(move, -1.0, 1.0), covariance, correlation, share)
 
 
 def _finite(covariance: FloatArray) -> FloatArray:

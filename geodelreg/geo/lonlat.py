@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from affine import Affine
 from geodelreg.errors import CrsTransformError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
+from geodelreg.geo.grid import outline
 from geodelreg.values.raster import FloatArray, Grid
 
 _PER_EDGE = 4
@@ -35,11 +35,8 @@ def footprint(grid: Grid, transform: Affine) -> dict[str, Any] | None:
     """
     from pyproj import CRS
 
-    height, width = grid.shape
-    corners = np.array([[0, 0], [0, height], [width, height], [width, 0], [0, 0]], dtype=np.float64)
-    along = np.linspace(0.0, 1.0, _PER_EDGE, endpoint=False)[:, None]
-    edges = [start + along * (end - start) for start, end in pairwise(corners)]
-    ring = np.vstack([*edges, corners[:1]])
+    edge = outline(grid, _PER_EDGE)
+    ring = np.vstack([edge, edge[:1]])[::-1]
     try:
         wgs84 = CRS.from_epsg(4326).to_wkt()
         lonlat = map_points(apply_affine(transform, ring), grid.crs_wkt, wgs84)
