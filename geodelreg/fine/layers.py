@@ -112,16 +112,11 @@ def in_doubt(ground: Guess | None, everywhere: Guess | None, working_px: FloatAr
         MS pixels to one pixel of the overview, along columns and rows.
     """
     found = [guess for guess in (ground, everywhere) if guess is not None]
-    if ground is None or everywhere is None or _contradicts(ground, everywhere, working_px):
+    if ground is None or everywhere is None:
         return found
-    return [everywhere]
-
-
-def _contradicts(ground: Guess, everywhere: Guess, working_px: FloatArray) -> bool:
-    """True when most matches of the one guess do not fit the other."""
     gap = everywhere.map.forward(ground.source_px) - ground.header_px
     off = np.hypot(*(gap / working_px).T) > _CONTRADICTION_PX
-    return bool(off.mean() > 0.5)
+    return found if off.mean() > 0.5 else [everywhere]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,23 +62,24 @@ def consensus(
         source_xy, reference_xy, method=cv2.RANSAC, ransacReprojThreshold=threshold_px,
         maxIters=_MOST_SAMPLES, confidence=1.0 - _MISSED,
     )  # fmt: skip
-    matrix = None if found is None else np.asarray(found, dtype=np.float64)
-    if matrix is None or not _is_plausible(matrix):
-        return nothing
+    matrix = np.full((2, 3), np.nan) if found is None else np.asarray(found, dtype=np.float64)
     best = AffineMap.of(matrix)
+    if not _is_plausible(best):
+        return nothing
     for loosening in _LOOSENING:  # two or three exact matches alone aim badly at the others
         near = radial_residuals(best, source_xy, reference_xy) <= loosening * threshold_px
         if near.sum() <= _FEWEST[kind]:
             break
         closer = fit_plainly(source_xy[near], reference_xy[near], kind)
-        if not _is_plausible(affine_matrix(closer.as_affine())):
+        if not _is_plausible(closer):
             break
         best = closer
     return Consensus(best, radial_residuals(best, source_xy, reference_xy) <= threshold_px)
 
 
-def _is_plausible(matrix: FloatArray) -> bool:
+def _is_plausible(there: AffineMap) -> bool:
     """True of a transformation that is finite, does not mirror, and stretches by at most 1:8."""
+    matrix = affine_matrix(there.affine)
     linear = matrix[:, :2]
     if not (np.isfinite(matrix).all() and np.linalg.det(linear) > 0):
         return False

@@ -103,16 +103,12 @@ def design(
 
 def _projective_design(u: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eight parameters: those of the affine, and the two of the horizon."""
-    affine, base = _affine_columns(u), u
+    affine, base = design("affine", u, Frame((0.0, 0.0), 1.0))
     horizon = p[affine.shape[2] :]
     depth = (1.0 + u @ horizon)[:, None]
     there = (base + affine @ p[: affine.shape[2]]) / depth
     columns = np.concatenate([affine, -there[:, :, None] * u[:, None, :]], axis=2) / depth[:, None]
     return columns, there - columns @ p
-
-
-def _affine_columns(u: FloatArray) -> FloatArray:
-    return design("affine", u, Frame((0.0, 0.0), 1.0))[0]
 
 
 def generators(model: str, frame: Frame) -> FloatArray:

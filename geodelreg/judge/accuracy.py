@@ -11,7 +11,7 @@ from geodelreg.fine.overlay import Overlay
 from geodelreg.fit.choice import Selection
 from geodelreg.geo.grid import outline
 from geodelreg.judge.unshared import PULL_PX
-from geodelreg.pair import Pair, Roles, overlap_corners
+from geodelreg.pair import Roles, overlap_corners
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray
@@ -52,47 +52,35 @@ def measure_points(
     part: Roles, points: TiePoints, selection: Selection, unshared: float = 0.0
 ) -> Accuracy:
     """What the points alone say of it; what needs the images is not known."""
-    pair, kept = part.pair, points.kept
-    correction = selection.estimate.map
-    unmoved = pair.header.forward(points.source_px[kept]) - points.reference_px[kept]
-    fit = points.residual_px[kept]
-    check_px, check_m = _held_out(pair, points, selection)
+    pair, kept, correction = part.pair, points.kept, selection.estimate.map
+    at = points.source_px[kept]
+    unmoved = pair.header.forward(at) - points.reference_px[kept]
+    check = selection.held_out_px[selection.estimate.inlier]
+    in_pan = pair.header.linearise(correction.forward(at))[:, :, :2]
+    check_px = np.einsum("pij,pj->pi", in_pan, check)
+    check_m = check * np.array(pair.source_gsd_m)
     ratio = pair.pan_px_per_source_px
     floor = math.hypot(SYSTEMATIC_PX, PULL_PX * math.sqrt(unshared)) * pair.pan_px_per_coarser_px
     pan_m = float(np.sqrt(pair.reference_gsd_m[0] * pair.reference_gsd_m[1]))
+    centre_px, corner_px = (
+        ratio * float(correction.sigma_at(xy).max())
+        for xy in (pair.source_centre, overlap_corners(part, correction))
+    )
     return Accuracy(
-        fit_rmse_px=_rms(fit),
+        fit_rmse_px=_rms(points.residual_px[kept]),
         check_rmse_px=_rms(check_px),
         check_ce90_px=_ce90(check_px),
         check_rmse_m=_rms(check_m),
         check_ce90_m=_ce90(check_m),
         before_rmse_px=_rms(unmoved),
         before_rmse_m=_rms(unmoved) * pan_m,
-        sigma_centre_px=math.hypot(ratio * _sigma(selection, pair.source_centre), floor),
-        sigma_corner_px=math.hypot(
-            ratio * _sigma(selection, overlap_corners(part, correction)),
-            ratio * selection.neglected_px,
-            floor,
-        ),
+        sigma_centre_px=math.hypot(centre_px, floor),
+        sigma_corner_px=math.hypot(corner_px, ratio * selection.neglected_px, floor),
         systematic_px=floor,
         coverage=_coverage(part, points, correction),
         kept=int(kept.sum()),
         checked=int(np.isfinite(check_px).all(axis=1).sum()),
     )
-
-
-def _sigma(selection: Selection, xy: FloatArray) -> float:
-    """Largest radial standard error at (N, 2) MS pixels, in MS pixels."""
-    return float(selection.estimate.map.sigma_at(xy).max())
-
-
-def _held_out(pair: Pair, points: TiePoints, selection: Selection) -> tuple[FloatArray, FloatArray]:
-    """Held-out residuals of the kept points, in PAN pixels and in metres."""
-    residual = selection.held_out_px[selection.estimate.inlier]
-    at = points.source_px[points.kept]
-    local = pair.header.linearise(selection.estimate.map.forward(at))[:, :, :2]
-    in_pan = np.einsum("pij,pj->pi", local, residual)
-    return in_pan, residual * np.array(pair.source_gsd_m)
 
 
 def _rms(vectors: FloatArray) -> float:
