@@ -11,24 +11,20 @@ from geodelreg.values.raster import Band, BoolArray
 
 MAX_SAMPLES = 250_000  # of which the 0.5th percentile is known to 0.014 %
 FULL_SCALE = 255.0  # of 8 bit
-LOW_PERCENT, HIGH_PERCENT = 0.5, 99.5  # outliers in half a percent; by hand: ½ to 2 × alike
+_PERCENT = (0.5, 99.5)  # outliers in half a percent; by hand: ½ to 2 × alike
 _LEAST_SAMPLES = 1000  # by hand: ½ to 2 × alike
 _MASK_SIZE = 5  # of OpenCV's distance transform: the nearest that is precise to 2 %
 
 
-def to_uint8(
-    band: Band, low_percent: float = LOW_PERCENT, high_percent: float = HIGH_PERCENT
-) -> NDArray[np.uint8]:
-    """Stretch a band to 8 bit between two percentiles of its valid pixels.
+def to_uint8(band: Band) -> NDArray[np.uint8]:
+    """Stretch a band to 8 bit between the percentiles 0.5 and 99.5 of its valid pixels.
 
-    Invalid pixels take the value of the nearest valid one, so that their border makes no edge.
+    Those are of at most about 250 000 pixels on a regular lattice.  Invalid pixels take the value
+    of the nearest valid one, so that their border makes no edge.
 
     Parameters
     ----------
     band : Band
-    low_percent, high_percent : float
-        Percentiles that become 0 and 255; taken over at most about 250 000 pixels on a regular
-        lattice.
 
     Returns
     -------
@@ -39,14 +35,14 @@ def to_uint8(
     NoDataError
         If no pixel is valid or all valid pixels are equal.
     """
-    low, high = _stretch_limits(band, low_percent, high_percent)
+    low, high = _stretch_limits(band)
     scale = FULL_SCALE / (high - low)
     stretched = np.clip((band.data - np.float32(low)) * np.float32(scale), 0.0, FULL_SCALE)
     grey = np.rint(stretched).astype(np.uint8)
     return grey if band.valid.all() else _fill_from_nearest(grey, band.valid)
 
 
-def _stretch_limits(band: Band, low_percent: float, high_percent: float) -> tuple[float, float]:
+def _stretch_limits(band: Band) -> tuple[float, float]:
     step = max(1, int(np.sqrt(band.data.size / MAX_SAMPLES)))
     sample = band.data[::step, ::step][band.valid[::step, ::step]]
     if sample.size < min(_LEAST_SAMPLES, band.data.size):
@@ -55,7 +51,7 @@ def _stretch_limits(band: Band, low_percent: float, high_percent: float) -> tupl
         raise NoDataError(
             f"{_name(band)} has no valid pixel", "Check its no-data value and its mask."
         )
-    low, high = (float(v) for v in np.percentile(sample, (low_percent, high_percent)))
+    low, high = (float(v) for v in np.percentile(sample, _PERCENT))
     if not high > low:
         values = band.data[band.valid]
         low, high = float(values.min()), float(values.max())

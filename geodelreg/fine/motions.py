@@ -74,9 +74,9 @@ def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
     # the others belong to the layer of most of the neighbours that they fit to
     number = max(int(label.max(initial=-1)) + 1, 1)
     votes = np.zeros((count, number), dtype=np.intp)
-    for one, other in (pairs[good].T, pairs[good].T[::-1]):
-        known = core[other] & ~core[one]
-        np.add.at(votes, (one[known], label[other[known]]), 1)
+    one, other = np.concatenate([pairs[good], pairs[good][:, ::-1]]).T
+    known = core[other] & ~core[one]
+    np.add.at(votes, (one[known], label[other[known]]), 1)
     edge = ~core & (votes.max(axis=1) > 0)
     label[edge] = votes[edge].argmax(axis=1)
     return label

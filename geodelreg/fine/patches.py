@@ -71,13 +71,9 @@ def cut_patches(bands: list[Band], full: Grid, size: int) -> Patches:
     grid_y, grid_x = np.mgrid[0:rows, 0:columns]
     origins = np.stack([left + grid_x.ravel() * size, top + grid_y.ravel() * size], axis=1)
 
-    def cut(image: NDArray[Any]) -> NDArray[Any]:
-        inner = image[top : top + rows * size, left : left + columns * size]
-        parts = inner.reshape(rows, size, columns, size).swapaxes(1, 2)
-        return np.ascontiguousarray(parts).reshape(len(origins), size * size)
-
-    values = np.stack([cut(band.data) for band in bands], axis=1)
-    valid = np.logical_and.reduce([cut(band.valid) for band in bands])
+    whole = np.s_[top : top + rows * size, left : left + columns * size]
+    values = np.stack([squares(band.data[whole], size) for band in bands], axis=1)
+    valid = np.logical_and.reduce([squares(band.valid[whole], size) for band in bands])
     to_full = ~full.transform @ bands[0].grid.transform
     centre = origins + size / 2.0
     centre = np.stack(
@@ -85,6 +81,13 @@ def cut_patches(bands: list[Band], full: Grid, size: int) -> Patches:
     )
     owner = np.zeros(len(centre), dtype=np.intp)
     return Patches(centre, values, valid, np.array([to_full.a, to_full.e]), size, owner)
+
+
+def squares(image: NDArray[Any], size: int) -> NDArray[Any]:
+    """(P, size²) the squares that an image of whole ones is made of, row by row."""
+    rows, columns = (side // size for side in image.shape)
+    parts = image.reshape(rows, size, columns, size).swapaxes(1, 2)
+    return np.ascontiguousarray(parts).reshape(rows * columns, size * size)
 
 
 def patch_offsets(index: IntArray, size: int) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from geodelreg.coarse.correlation import around, common_parts, detail_pair, masked_correlation
 from geodelreg.fine.overlay import Overlay
+from geodelreg.fine.patches import squares
 from geodelreg.values.raster import Float32Array, FloatArray
 
 _NEAR_PX = 8  # by hand: 2 × refuses 1 of 36
@@ -147,8 +148,6 @@ def _block_correlation(one: Float32Array, other: Float32Array, moved: tuple[int,
 
 def _blocks(image: Float32Array) -> FloatArray:
     """(N, n²) blocks less their means."""
-    rows, columns = (side // _BLOCK_PX for side in image.shape)
-    cut = image[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
-    parts = cut.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).swapaxes(1, 2)
-    values = parts.reshape(rows * columns, _BLOCK_PX**2).astype(np.float64)
+    height, width = (side - side % _BLOCK_PX for side in image.shape)
+    values = squares(image[:height, :width], _BLOCK_PX).astype(np.float64)
     return np.asarray(values - values.mean(axis=1, keepdims=True))
