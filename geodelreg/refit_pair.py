@@ -211,8 +211,7 @@ def _fit(
         inlier, judged = fit.inlier, np.full(len(points), np.nan)
         judged[inlier] = fit.weight
     elif model == "tin":
-        noise = points.covariance[:, (0, 1), (0, 1)]
-        facets = facets_of(points.source, points.target, noise)
+        facets = facets_of(points.source, points.target, points.variances)
         selection = selection_of(facets, select_for(pair, points).estimate.distance2, frame)
         inlier, judged = np.ones(len(points), dtype=np.bool_), np.ones(len(points))
     else:

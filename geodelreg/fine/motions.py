@@ -85,7 +85,7 @@ def layers(xy: FloatArray, move: FloatArray, sigma_px: FloatArray) -> IntArray:
 def largest_layer(points: Observations, correction: PixelMap) -> BoolArray:
     """(N,) True of the points that are one smooth ground, however far from where a map has them."""
     move = points.target - correction.forward(points.source)
-    sigma = np.sqrt(points.covariance.trace(axis1=1, axis2=2))
+    sigma = np.sqrt(points.variances.sum(axis=1))
     return np.asarray(layers(points.source, move, sigma) == 0)
 
 

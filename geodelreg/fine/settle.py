@@ -13,12 +13,12 @@ import numpy as np
 
 from geodelreg.fine.least_squares import Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
-from geodelreg.fine.motions import layers
+from geodelreg.fine.motions import largest_layer
 from geodelreg.fine.passes import Refinement
 from geodelreg.fine.tiles import SMALLEST_PATCH_PX, patch_size, plan_tiles, read_tiles
 from geodelreg.fine.tuning import fit_sigma, fit_tone
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.field import FEWEST_POINTS, FieldFit, fit_field
+from geodelreg.fit.field import FieldFit, determine_field, fit_field
 from geodelreg.fit.jumps import cut_at_jumps
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.pair import overlap_in_template
@@ -151,10 +151,9 @@ def _passes(refined: Refinement, start: PixelMap, size: int) -> Settled | None:
         good = np.flatnonzero(matched.status == Status.KEPT)
         good = good[np.isfinite(points.covariance[good]).all(axis=(1, 2))]
         some = points.take(good)
-        own = np.sqrt(some.covariance.trace(axis1=1, axis2=2))
-        ground = good[layers(some.source, some.target - current.forward(some.source), own) == 0]
+        ground = good[largest_layer(some, current)]
         some = points.take(ground)
-        if len(some) < FEWEST_POINTS or not np.ptp(some.source, axis=0).min() > 0:
+        if not determine_field(some):
             return settled
         if settled is None:
             fit = cut_at_jumps(some, fit_field(some, kernel))
@@ -179,8 +178,7 @@ def _bends(settled: Settled) -> bool:
     what looks like noise may be the field.
     """
     kernel, size = settled.fit.field.kernel, settled.refined.size
-    covariance = settled.points.covariance[settled.ground]
-    own = float(np.median(covariance.trace(axis1=1, axis2=2))) / 2
+    own = float(np.median(settled.points.variances[settled.ground].sum(axis=1))) / 2
     variance = max(kernel.variance_px2)
     steep = variance > own and kernel.range_px < _STEEP * size
     hidden = _FLATTENED * variance**0.5 * (size / kernel.range_px) ** 2

@@ -44,6 +44,11 @@ class Observations:
     def __len__(self) -> int:
         return len(self.source)
 
+    @property
+    def variances(self) -> FloatArray:
+        """(N, 2) of `target` along columns and rows, in source pixels squared."""
+        return self.covariance[:, (0, 1), (0, 1)]
+
     def take(self, keep: BoolArray | IntArray) -> Observations:
         """The pairs where `keep` is True, or with the indices in it."""
         return Observations(self.source[keep], self.target[keep], self.covariance[keep])

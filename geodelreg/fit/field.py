@@ -77,11 +77,8 @@ def fit_field(
     ValueError
         With fewer than `FEWEST_POINTS` points, or points on a line.
     """
-    if len(points) < FEWEST_POINTS:
-        raise ValueError(f"{len(points)} points cannot determine a field")
-    extent = np.ptp(points.source, axis=0)
-    if not extent.min() > 0:
-        raise ValueError("points on a line cannot determine a field")
+    if not determine_field(points):
+        raise ValueError(f"{len(points)} points, or points on a line, cannot determine a field")
     inlier, weight = ~np.isin(points.source[:, 1], jumps), np.ones(len(points))
     distance2 = np.where(inlier, 0.0, np.inf)
     kernel = start or _first_guess(points)
@@ -100,6 +97,11 @@ def fit_field(
         inlier = inlier & enough
     field = field_of(points.take(inlier), kernel, weight[inlier], jumps)
     return FieldFit(field, weight[inlier], inlier, distance2)
+
+
+def determine_field(points: Observations) -> bool:
+    """True of points that are enough for a field, and do not lie on a line of pixels."""
+    return len(points) >= FEWEST_POINTS and bool(np.ptp(points.source, axis=0).min() > 0)
 
 
 def fit_again(
@@ -127,7 +129,7 @@ def fit_again(
 def _unlike(field: FieldMap, points: Observations) -> FloatArray:
     """(N,) squared distance of a field's points from what the others predict, in variances."""
     residual, variance = field.left_out()
-    own = points.covariance[:, (0, 1), (0, 1)] + field.kernel.nugget_px2
+    own = points.variances + field.kernel.nugget_px2
     return np.asarray((residual**2 / (variance + own)).sum(axis=1))
 
 
@@ -146,7 +148,7 @@ def field_of(
     points: Observations, kernel: Kernel, weight: FloatArray, jumps: tuple[float, ...] = ()
 ) -> FieldMap:
     """The field through points whose noise is divided by (N,) weights."""
-    own = points.covariance[:, (0, 1), (0, 1)] + kernel.nugget_px2
+    own = points.variances + kernel.nugget_px2
     return FieldMap(points.source, points.target, own / weight[:, None], kernel, jumps)
 
 
@@ -173,7 +175,7 @@ def tuned(
     columns, apart = first.columns(points.source), distances(points.source, points.source)
     together = first.correlation(points.source, points.source) > 0 if jumps else None
     move = points.target - points.source
-    own = points.covariance[:, (0, 1), (0, 1)]
+    own = points.variances
 
     def kernel_of(theta: FloatArray) -> Kernel:
         range_px, one, other, nugget = (float(value) for value in np.exp(theta))
@@ -215,7 +217,7 @@ def _first_guess(points: Observations) -> Kernel:
     columns = np.column_stack([points.source, np.ones(len(points))])
     left = move - columns @ np.linalg.lstsq(columns, move, rcond=None)[0]
     variance = np.maximum(left.var(axis=0), _LEAST_VARIANCE_PX2)
-    noise = float(np.median(points.covariance.trace(axis1=1, axis2=2))) / 2
+    noise = float(np.median(points.variances.sum(axis=1))) / 2
     return Kernel(
         4 * spacing_px, (float(variance[0]), float(variance[1])), max(noise, _LEAST_NUGGET_PX2)
     )
@@ -239,9 +241,8 @@ def facets_of(source: FloatArray, target: FloatArray, noise_px2: FloatArray) -> 
     plain = TinMap(source, target, noise_px2)
     error2 = held_out_errors(plain) ** 2
     known = np.isfinite(error2).all(axis=1)
-    return (
-        replace(plain, noise_px2=noise_px2 + error2[known].mean(axis=0)) if known.any() else plain
-    )
+    more = error2[known].mean(axis=0) if known.any() else 0.0
+    return replace(plain, noise_px2=noise_px2 + more)
 
 
 def held_out_errors(field: Follower) -> FloatArray:

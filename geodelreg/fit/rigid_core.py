@@ -26,7 +26,7 @@ def rigid_core(points: Observations, unit: float) -> BoolArray:
     If they stand out from the others they are the core; over relief, which displaces neighbours
     alike and no place as it does the next, none do, and all points have their say.
     """
-    variance = points.covariance[:, 0, 0] + points.covariance[:, 1, 1]
+    variance = points.variances.sum(axis=1)
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance))), _CORE_FLOOR_PX * unit)
     move = points.target - points.source
     apart = np.hypot(*(move[:, None] - move[None]).transpose(2, 0, 1))

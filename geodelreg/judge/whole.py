@@ -21,7 +21,7 @@ from geodelreg.fine.tone import single_band
 from geodelreg.fit.choice import Fitted
 from geodelreg.fit.consensus import fit_plainly
 from geodelreg.fit.estimate import Observations
-from geodelreg.fit.field import FEWEST_POINTS, fit_field, spacing
+from geodelreg.fit.field import FEWEST_POINTS, determine_field, fit_field, spacing
 from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.field import FieldMap
@@ -290,8 +290,8 @@ def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
     if not known.any():
         return None
     difference -= np.median(difference[known], axis=0)
-    variance = first.covariance + second.covariance
-    return height_parallax(move, difference, np.sqrt(variance.trace(axis1=1, axis2=2)))
+    variance = (first.variances + second.variances).sum(axis=1)
+    return height_parallax(move, difference, np.sqrt(variance))
 
 
 def _moves(status: StatusArray, points: Observations, correction: PixelMap) -> FloatArray:
@@ -344,9 +344,9 @@ def _bent(
         )
     member = largest_layer(points, correction)
     some = np.flatnonzero(member)[:: 1 + int(member.sum()) // _MOST_POINTS]
-    if len(some) < FEWEST_POINTS or not np.ptp(points.source[some], axis=0).min() > 0:
-        return agreed, False
     ground_points = points.take(some)
+    if not determine_field(ground_points):
+        return agreed, False
     fit = fit_field(ground_points, refined.bend)
     agree = float(member.mean()) * fit.inlier.mean() > CALM_PATCHES
     gentle = agree and bends_gently(fit, spacing(ground_points))
