@@ -30,14 +30,11 @@ class CrsOperation:
     ----------
     description : str
         PROJ's description with its accuracy; "" for identical CRSs.
-    accuracy_m : float
-        NaN when PROJ does not know it.
     warning : str
         Non-empty when a better operation needs a grid that is not installed.
     """
 
     description: str = ""
-    accuracy_m: float = float("nan")
     warning: str = ""
 
 
@@ -65,8 +62,6 @@ def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOpera
             f"{_name(from_wkt)} and {_name(to_wkt)} is known{reason}",
             "Reproject one raster into the other's CRS, or correct its CRS definition.",
         ) from error
-    accuracy = float(transformer.accuracy)
-    accuracy = accuracy if accuracy >= 0 else float("nan")
     warning = ""
     if not group.best_available and group.unavailable_operations:
         best = group.unavailable_operations[0]
@@ -76,9 +71,9 @@ def _operation(from_wkt: str, to_wkt: str) -> tuple[Transformer | None, CrsOpera
             f"find; used {transformer.description!r} instead"
         )
     text = transformer.description
-    if accuracy == accuracy:
-        text = f"{text} (accuracy {accuracy:g} m)"
-    return transformer, CrsOperation(text, accuracy, warning)
+    if transformer.accuracy >= 0:  # else PROJ does not know it
+        text = f"{text} (accuracy {transformer.accuracy:g} m)"
+    return transformer, CrsOperation(text, warning)
 
 
 def _name(wkt: str) -> str:

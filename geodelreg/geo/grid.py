@@ -16,11 +16,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 
-def window_transform(grid: Grid, window: Window) -> Affine:
-    """Geotransform of a window of a raster."""
-    return grid.transform @ Affine.translation(window.column, window.row)
-
-
 def decimated_grid(grid: Grid, window: Window, shape: tuple[int, int] | None = None) -> Grid:
     """Grid of a window that is averaged down to `shape`.
 
@@ -37,7 +32,8 @@ def decimated_grid(grid: Grid, window: Window, shape: tuple[int, int] | None = N
     """
     height, width = shape or (window.height, window.width)
     scale = Affine.scale(window.width / width, window.height / height)
-    return Grid(window_transform(grid, window) @ scale, (height, width), grid.crs_wkt)
+    corner = Affine.translation(window.column, window.row)
+    return Grid(grid.transform @ corner @ scale, (height, width), grid.crs_wkt)
 
 
 def is_north_up(grid: Grid) -> bool:
