@@ -9,23 +9,20 @@ import click
 
 from geodelreg.options import AlignOptions, WriteOptions, one_header
 from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
     build,
+    command,
     is_default,
     knob_options,
     ms_and_pan,
     run_options,
     start_run,
+    under,
 )
-from geodelreg_cli.results import Request, carries_all, output_params, request_of, run
+from geodelreg_cli.results import Request, carries_all, output_options, request_of, run
 
 if TYPE_CHECKING:
     from geodelreg.alignment import Alignment
     from geodelreg.pair import Progress
-
-CORRECTION, FORMAT = "How to align", "How OUT is written"
 
 EPILOG = """\
 Examples:
@@ -60,18 +57,15 @@ Exit codes: 0 done, 1 failed, 2 wrong usage, 3 refused (nothing written, the rea
 """
 
 
-def align_params() -> list[SectionOption]:
-    """Options of ``align``, in the order of the help."""
-    return [
-        *output_params(),
-        *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
-        *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
-        *run_options(),
-    ]
+OPTIONS = [
+    *output_options(),
+    *under("How to align", *knob_options(AlignOptions, without=["threads", "allow"])),
+    *under("How OUT is written", *knob_options(WriteOptions, without=["overwrite"])),
+    *run_options(),
+]
 
 
-@add_options(align_params())
-@click.command(cls=SectionCommand, epilog=EPILOG)
+@command(EPILOG, OPTIONS)
 @click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
 def align(rasters: tuple[str, ...], **given: Any) -> None:
     """Correct the georeferencing of MS so that it fits PAN.
@@ -83,12 +77,11 @@ def align(rasters: tuple[str, ...], **given: Any) -> None:
     """
     start_run(given)
     request = _request(rasters, given)
-    source = request.sources[0] if len(request.sources) == 1 else request.sources
 
     def find(progress: Progress) -> Alignment:
         import geodelreg
 
-        return geodelreg.align(source, rasters[-1], request.options, progress=progress)
+        return geodelreg.align(request.sources, rasters[-1], request.options, progress=progress)
 
     run(request, find)
 

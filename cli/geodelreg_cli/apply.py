@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +9,20 @@ import click
 
 from geodelreg.errors import shown
 from geodelreg.options import AlignOptions, WriteOptions
-from geodelreg_cli.console import configure_logging
+from geodelreg_cli.console import warn
 from geodelreg_cli.options import (
+    FILE,
     RUN,
-    SectionCommand,
-    add_options,
     build,
-    keep_to,
+    command,
+    flag,
     knob_option,
     knob_options,
+    message_options,
+    option,
+    start_run,
+    under,
 )
-
-FILE = click.Path(path_type=Path)
 
 EPILOG = """\
 Examples:
@@ -40,38 +41,26 @@ Exit codes: 0 done, 1 failed, 2 wrong usage.
 """
 
 
-@add_options(
-    [
-        *knob_options(WriteOptions, "How OUT is written", without=["georef"]),
-        knob_option(AlignOptions, "allow", RUN),
-    ]
-)
-@click.command(cls=SectionCommand, epilog=EPILOG)
+OPTIONS = [
+    option(
+        "-o",
+        "--output",
+        type=FILE,
+        metavar="OUT",
+        help="Output; of several files the folder for them.",
+    ),
+    flag("--in-place", help="Correct the headers of the files themselves."),
+    flag("--force", help="Also where a file lies elsewhere than MS did, or was corrected before."),
+    *message_options(),
+    *under("How OUT is written", *knob_options(WriteOptions, without=["georef"])),
+    *under(RUN, knob_option(AlignOptions, "allow")),
+]
+
+
+@command(EPILOG, OPTIONS)
 @click.argument("correction", metavar="CORRECTION.json", type=FILE)
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=FILE)
-@click.option(
-    "-o", "--output", type=FILE, metavar="OUT", help="Output; of several files the folder for them."
-)
-@click.option("--in-place", is_flag=True, help="Correct the headers of the files themselves.")
-@click.option(
-    "--force",
-    is_flag=True,
-    help="Also where a file lies elsewhere than MS did, or was corrected before.",
-)
-@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-@click.option("-v", "--verbose", count=True, help="Print the steps; -vv everything.")
-@click.option("--debug", is_flag=True, help="Print a traceback with an error.")
-def apply(
-    correction: Path,
-    files: tuple[Path, ...],
-    output: Path | None,
-    in_place: bool,
-    force: bool,
-    quiet: bool,
-    verbose: int,
-    debug: bool,
-    **given: Any,
-) -> None:
+def apply(correction: Path, files: tuple[Path, ...], **given: Any) -> None:
     """Apply the correction in a report of align to other files with the same error.
 
     Rasters of any pixel size and CRS get a corrected header and keep their pixels, or are resampled
@@ -79,8 +68,8 @@ def apply(
     corrected coordinates. Of several files all are written or none. After align --per-band, each
     band of a raster is put where it lies: OUT is a folder, a .vrt, or resampled (--warp).
     """
-    configure_logging(verbose, quiet, debug)
-    keep_to(given["allow"])
+    start_run(given)
+    output, in_place = given["output"], given["in_place"]
     if (output is None) != in_place:
         raise click.UsageError("Say where the result goes: one of -o OUT, --in-place.")
     options = build(WriteOptions, given | {"georef": "geotransform"})
@@ -99,9 +88,8 @@ def apply(
         for number, file in enumerate(files):
             target = output if apart or output is None else targets[number]
             notes = geodelreg.apply(
-                correction, file, target, options, force=force, allow=given["allow"]
+                correction, file, target, options, force=given["force"], allow=given["allow"]
             )
-            for note in notes:
-                logging.getLogger(__name__).warning("warning: %s", note)
-            if not quiet:
+            warn(notes)
+            if not given["quiet"]:
                 click.echo(f"{shown(str(target or file))}: corrected", err=True)

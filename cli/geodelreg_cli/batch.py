@@ -15,23 +15,22 @@ from geodelreg.errors import ManifestError, shown
 from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions, BatchOptions, WriteOptions
 from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
+    FILE,
     build,
+    command,
     flag,
     knob_option,
     knob_options,
+    option,
     run_options,
     start_run,
+    under,
 )
 
 if TYPE_CHECKING:
     from geodelreg.batch import Batch, PairResult
 
-PAIRS, LEDGER, RUNNING = "Which pairs", "What is kept", "How they run"
-CORRECTION, FORMAT = "How to align", "How OUT is written"
-FILE = click.Path(path_type=Path)
+WHAT = ("check", "limit_px", "in_place")
 MISALIGNED, REFUSED = 4, 3
 RETRY = {"refused": ("refused", "cannot_tell"), "failed": ("failed",)}
 SHOWN = 10
@@ -65,107 +64,95 @@ be told; else 0. 2 wrong usage, or a manifest with a mistake: nothing was starte
 """
 
 
-def batch_params() -> list[SectionOption]:
-    """Options of ``batch``, in the order of the help."""
-    return [
-        flag(
+OPTIONS = [
+    *under(
+        "Which pairs",
+        option(
             "--pair",
             nargs=2,
             metavar="MS PAN",
-            section=PAIRS,
             help="Patterns of the names of MS and PAN in place of a manifest. {field} stands for "
             "the same text in all patterns; *, ?, [...] and **/ for any.",
         ),
-        flag(
+        option(
             "-o",
             "--output",
             metavar="OUT",
-            section=PAIRS,
             help="Pattern of the outputs of --pair; a folder where there are several MS files.",
         ),
-        flag(
+        option(
             "--out-root",
             type=FILE,
             metavar="FOLDER",
-            section=PAIRS,
             help="Outputs stay below this folder, and relative ones begin there; by default the "
             "manifest's, with --pair the current one.",
         ),
-        knob_option(BatchOptions, "check", PAIRS),
-        knob_option(BatchOptions, "limit_px", PAIRS),
-        knob_option(BatchOptions, "in_place", PAIRS),
-        knob_option(WriteOptions, "overwrite", PAIRS),
+        *(knob_option(BatchOptions, name) for name in WHAT),
+        knob_option(WriteOptions, "overwrite"),
         flag(
             "--dry-run",
-            is_flag=True,
-            section=PAIRS,
             help="Check all pairs and print them, one line of JSON each; start nothing.",
         ),
-        flag(
+    ),
+    *under(
+        "What is kept",
+        option(
             "--ledger",
             type=FILE,
             metavar="FILE",
-            section=LEDGER,
             help="SQLite file with what became of each pair; by default pairs.ledger beside "
             "pairs.csv, with --pair batch.ledger in --out-root.",
         ),
-        flag(
-            "--resume",
-            is_flag=True,
-            section=LEDGER,
-            help="Go on with an existing ledger: what is finished is not repeated.",
-        ),
-        flag(
+        flag("--resume", help="Go on with an existing ledger: what is finished is not repeated."),
+        option(
             "--retry",
             type=click.Choice(tuple(RETRY)),
             multiple=True,
-            section=LEDGER,
             help="Go on, and run the pairs once more that were refused (with --check: cannot be "
             "told), or failed. May be repeated.",
         ),
-        flag(
+        option(
             "--table",
             type=FILE,
             multiple=True,
             metavar="FILE",
-            section=LEDGER,
             help="All results at the end: .csv, .parquet (needs the parquet extra), or .html to "
             "look at (needs the report extra). May be repeated. Without it a CSV beside the "
             "ledger, pairs.results.csv for pairs.ledger.",
         ),
-        flag(
+        option(
             "--footprints",
             type=FILE,
             multiple=True,
             metavar="FILE",
-            section=LEDGER,
             help="Where each MS lies, with its outcome: .geojson, or .gpkg (needs the vector "
             "extra). May be repeated.",
         ),
-        flag(
+        option(
             "--report-dir",
             type=FILE,
             metavar="FOLDER",
-            section=LEDGER,
             help="Pages to look at: index.html with a table and a map of all pairs, and one page a "
             "pair, also of refused ones (needs the report extra).",
         ),
-        *knob_options(BatchOptions, RUNNING, without=["check", "limit_px", "in_place"]),
-        flag(
+    ),
+    *under(
+        "How they run",
+        *knob_options(BatchOptions, without=WHAT),
+        option(
             "--dask",
             metavar="ADDRESS",
-            section=RUNNING,
             help="Scheduler of a cluster of Dask, whose workers see the same files (needs the "
             "batch extra).",
         ),
-        *knob_options(AlignOptions, CORRECTION, without=["threads", "allow"]),
-        *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
-        *(option for option in run_options() if option.name != "threads"),
-    ]
+    ),
+    *under("How to align", *knob_options(AlignOptions, without=["threads", "allow"])),
+    *under("How OUT is written", *knob_options(WriteOptions, without=["overwrite"])),
+    *run_options(threads=False),
+]
 
 
-@add_options(batch_params())
-@click.command(cls=SectionCommand, epilog=EPILOG)
+@command(EPILOG, OPTIONS)
 @click.argument("manifest", metavar="[MANIFEST]", required=False, type=FILE)
 def batch(manifest: Path | None, **given: Any) -> int:
     """Align, or check, many pairs, and keep a ledger of what became of each.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,24 +9,23 @@ import click
 from geodelreg.errors import AlignmentRefusedError
 from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions
-from geodelreg_cli.console import log_steps, progress_bar
+from geodelreg_cli.console import log_steps, progress_bar, warn
 from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
     build,
+    command,
+    flag,
     knob_options,
     ms_and_pan,
+    option,
     run_options,
     start_run,
+    under,
 )
 
 if TYPE_CHECKING:
     from geodelreg.product.check import Check
 
-VERDICT, MEASUREMENT = "Verdict", "How to measure"
 MISALIGNED = 4
-RUNS = ("threads", "allow")
 JUDGED = {"tolerance_px": 0.0, "max_residual_px": 0.5, "on_local": "warn", "north_up": False}
 """By --tolerance, in the place of what `align` has."""
 
@@ -50,42 +48,38 @@ Exit codes: 0 aligned, 1 failed, 2 wrong usage, 3 cannot tell (the reason on std
 """
 
 
-def check_params() -> list[SectionOption]:
-    """Options of ``check``, in the order of the help."""
-    return [
-        SectionOption(
-            ["limit_px", "--tolerance"],
+OPTIONS = [
+    *under(
+        "Verdict",
+        option(
+            "limit_px",
+            "--tolerance",
             type=click.FloatRange(0.0, 1e6),
             default="0.5",
             show_default=True,
             metavar="PX",
-            section=VERDICT,
             help="Largest misalignment, anywhere in the overlap, that counts as aligned, in PAN "
             "pixels. Beyond it by more than 3 standard errors is misaligned; when 3 standard "
             "errors exceed PX, a raster that is not misaligned cannot be told to be aligned.",
         ),
-        SectionOption(
-            ["--per-band"],
-            is_flag=True,
-            section=VERDICT,
+        flag(
+            "--per-band",
             help="Also find each MS band, as align --per-band does; one misaligned band is "
             "misaligned (exit 4).",
         ),
-        SectionOption(
-            ["--json"],
-            is_flag=True,
-            section=VERDICT,
-            help="Print the report on stdout in place of the text; its block is .check.",
+        flag(
+            "--json", help="Print the report on stdout in place of the text; its block is .check."
         ),
-        *knob_options(
-            AlignOptions, MEASUREMENT, without=[*RUNS, *JUDGED, "per_band", "band_model"]
-        ),
-        *run_options(),
-    ]
+    ),
+    *under(
+        "How to measure",
+        *knob_options(AlignOptions, [*JUDGED, "per_band", "band_model", "threads", "allow"]),
+    ),
+    *run_options(),
+]
 
 
-@add_options(check_params())
-@click.command(cls=SectionCommand, epilog=EPILOG)
+@command(EPILOG, OPTIONS)
 @click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
 def check(rasters: tuple[str, ...], **given: Any) -> int:
     """Tell whether MS lies where PAN says, and write nothing.
@@ -101,11 +95,7 @@ def check(rasters: tuple[str, ...], **given: Any) -> int:
 
     with progress_bar(given["quiet"]) as bar:
         found = geodelreg.check(
-            sources[0] if len(sources) == 1 else sources,
-            reference,
-            options,
-            limit_px=given["limit_px"],
-            progress=log_steps(bar),
+            sources, reference, options, limit_px=given["limit_px"], progress=log_steps(bar)
         )
     _show(found, given)
     return _exit_code(found)
@@ -116,10 +106,7 @@ def _show(found: Check, given: dict[str, Any]) -> None:
     from geodelreg.product.check import check_json, check_text
     from geodelreg.values.remedies import ROTATES
 
-    for warning in found.alignment.warnings:
-        if warning == ROTATES:
-            continue  # nothing is written
-        logging.getLogger(__name__).warning("warning: %s", warning)
+    warn(text for text in found.alignment.warnings if text != ROTATES)  # nothing is written
     if given["json"]:
         click.echo(check_json(found))
     elif not given["quiet"]:

@@ -9,7 +9,7 @@ import click
 from click.shell_completion import get_completion_class
 
 from geodelreg.errors import shown
-from geodelreg_cli.options import SectionCommand
+from geodelreg_cli.options import command, flag
 
 SHELLS = ("bash", "zsh", "fish")
 EPILOG = """\
@@ -26,9 +26,8 @@ its own, for zsh into ~/.zfunc, which has to be in fpath.
 """
 
 
-@click.command(cls=SectionCommand, epilog=EPILOG)
+@command(EPILOG, [flag("--install", help="Write it where the shell looks for it.")])
 @click.argument("shell", metavar="[bash|zsh|fish]", type=click.Choice(SHELLS), required=False)
-@click.option("--install", is_flag=True, help="Write it where the shell looks for it.")
 @click.pass_context
 def completion(context: click.Context, shell: str | None, install: bool) -> None:
     """Print or install the completion of geodelreg for a shell, by default the one in use."""
@@ -36,8 +35,7 @@ def completion(context: click.Context, shell: str | None, install: bool) -> None
     kind = get_completion_class(name)
     if name not in SHELLS or kind is None:
         raise click.UsageError(f"Say which shell: one of {', '.join(SHELLS)}.")
-    command = context.find_root().command
-    script = kind(command, {}, "geodelreg", "_GEODELREG_COMPLETE").source()
+    script = kind(context.find_root().command, {}, "geodelreg", "_GEODELREG_COMPLETE").source()
     if not install:
         click.echo(script)
         return

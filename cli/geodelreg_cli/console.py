@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +71,12 @@ def configure_logging(verbose: int, quiet: bool, debug: bool) -> None:
     logging.captureWarnings(True)
     if not (debug or verbose):  # GDAL's own threads know no logger and would print
         os.environ.setdefault("CPL_LOG", os.devnull)
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Warnings of the library, a line each."""
+    for text in texts:
+        logging.getLogger(__name__).warning("warning: %s", text)
 
 
 def log_steps(show: Progress | None) -> Progress:

@@ -9,14 +9,8 @@ import click
 
 from geodelreg.errors import UsageError
 from geodelreg.options import FIGURES
-from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
-    ms_and_pan,
-    start_run,
-)
-from geodelreg_cli.report import FILE, OUTPUT, again_options, check_output
+from geodelreg_cli.options import FILE, SectionOption, command, ms_and_pan, option, start_run
+from geodelreg_cli.report import again_options, check_output
 
 EPILOG = """\
 Examples:
@@ -27,14 +21,13 @@ Examples:
 """
 
 
-def kind_option(name: str, section: str) -> SectionOption:
+def kind_option(name: str) -> SectionOption:
     """Option that says what a figure shows."""
-    return SectionOption(
-        [name],
+    return option(
+        name,
         type=click.Choice(FIGURES),
         default="matches",
         show_default=True,
-        section=section,
         help="before-after: MS and PAN in turns, and one laid over the other; arrows: what the "
         "correction leaves at the tie points; mesh: their Delaunay mesh, and rejected points by "
         "reason; error: maps of the residual and of the standard error; matches: tie points joined "
@@ -42,13 +35,14 @@ def kind_option(name: str, section: str) -> SectionOption:
     )
 
 
-@add_options(
-    [
-        kind_option("--kind", OUTPUT),
-        *again_options("FILE.png", "PNG, SVG or PDF, by the extension; - is stdout, as PNG."),
-    ]
+OPTIONS = again_options(
+    kind_option("--kind"),
+    metavar="FILE.png",
+    help="PNG, SVG or PDF, by the extension; - is stdout, as PNG.",
 )
-@click.command(cls=SectionCommand, epilog=EPILOG)
+
+
+@command(EPILOG, OPTIONS)
 @click.argument("result", metavar="RESULT.json", type=FILE)
 @click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
 def figure(result: Path, rasters: tuple[str, ...], **given: Any) -> None:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from geodelreg.errors import shown
 from geodelreg.options import AlignOptions
-from geodelreg_cli.console import configure_logging
 from geodelreg_cli.options import (
+    FILE,
     GCP_FORMAT,
     RUN,
-    SectionCommand,
-    add_options,
-    keep_to,
+    command,
+    flag,
     knob_option,
+    message_options,
+    option,
+    start_run,
+    under,
 )
 
 if TYPE_CHECKING:
@@ -37,45 +40,36 @@ envi-map (image to map).
 """
 
 
-@add_options([knob_option(AlignOptions, "allow", RUN)])
-@click.command(cls=SectionCommand, epilog=EPILOG)
-@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
-@click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
-@click.option(
-    "--raster",
-    required=True,
-    metavar="MS",
-    help="Raster that the points belong to, with its original georeferencing.",
-)
-@click.option(
-    "--reference", metavar="PAN", help="Raster that the map coordinates come from (for ENVI)."
-)
-@click.option("--from", "from_format", type=GCP_FORMAT, help="Format of IN, if not by extension.")
-@click.option("--to", "to_format", type=GCP_FORMAT, help="Format of OUT, if not by extension.")
-@click.option("--overwrite", is_flag=True, help="Replace OUT when it exists.")
-@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-@click.option("-v", "--verbose", count=True, help="Print the steps; -vv everything.")
-@click.option("--debug", is_flag=True, help="Print a traceback with an error.")
+OPTIONS = [
+    option(
+        "--raster",
+        required=True,
+        metavar="MS",
+        help="Raster that the points belong to, with its original georeferencing.",
+    ),
+    option(
+        "--reference", metavar="PAN", help="Raster that the map coordinates come from (for ENVI)."
+    ),
+    option("--from", "from_format", type=GCP_FORMAT, help="Format of IN, if not by extension."),
+    option("--to", "to_format", type=GCP_FORMAT, help="Format of OUT, if not by extension."),
+    flag("--overwrite", help="Replace OUT when it exists."),
+    *message_options(),
+    *under(RUN, knob_option(AlignOptions, "allow")),
+]
+
+
+@command(EPILOG, OPTIONS)
+@click.argument("source", metavar="IN", type=FILE)
+@click.argument("target", metavar="OUT", type=FILE)
 def gcps(
-    source: Path,
-    target: Path,
-    raster: str,
-    reference: str | None,
-    from_format: str | None,
-    to_format: str | None,
-    overwrite: bool,
-    quiet: bool,
-    verbose: int,
-    debug: bool,
-    allow: str,
+    source: Path, target: Path, raster: str, reference: str | None, allow: str, **given: Any
 ) -> None:
     """Convert the ground control points of file IN to file OUT; - is stdout and needs --to.
 
     Pixel conventions are converted exactly (QGIS and ENVI count differently from GDAL), and map
     coordinates in another system than that of MS are transformed into it.
     """
-    configure_logging(verbose, quiet, debug)
-    keep_to(allow)
+    start_run({**given, "allow": allow})
     from geodelreg.door.opening import allowing
     from geodelreg.geotiff.atomic import together
     from geodelreg.product.gcps import GcpContext, in_crs_of, read_gcps, write_gcps
@@ -92,10 +86,12 @@ def gcps(
         source_paths=(raster,),
         reference_path=reference or "",
     )
-    points, crs_wkt = read_gcps(source, from_format, context)
+    points, crs_wkt = read_gcps(source, given["from_format"], context)
     points = in_crs_of(context.source, points, crs_wkt)
     rasters = [raster] if reference is None else [raster, reference]
     with allowing(allow), together(inputs=lambda: [source, *input_paths(rasters, allow)]):
-        write_gcps(target, points, to_format, context=context, overwrite=overwrite)
-    if not quiet:
+        write_gcps(
+            target, points, given["to_format"], context=context, overwrite=given["overwrite"]
+        )
+    if not given["quiet"]:
         click.echo(f"{shown(str(target))}: {len(points)} points", err=True)

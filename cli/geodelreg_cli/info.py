@@ -7,13 +7,7 @@ from typing import Any
 
 import click
 
-from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
-    run_options,
-    start_run,
-)
+from geodelreg_cli.options import command, flag, run_options, start_run, under
 
 EPILOG = """\
 Examples:
@@ -26,15 +20,13 @@ Examples:
 """
 
 
-@add_options(
-    [
-        SectionOption(
-            ["--json"], is_flag=True, section="Output", help="Print JSON, a line a file."
-        ),
-        *(option for option in run_options() if option.name != "threads"),
-    ]
-)
-@click.command(cls=SectionCommand, epilog=EPILOG)
+OPTIONS = [
+    *under("Output", flag("--json", help="Print JSON, a line a file.")),
+    *run_options(threads=False),
+]
+
+
+@command(EPILOG, OPTIONS)
 @click.argument("rasters", metavar="FILE...", nargs=-1, required=True)
 def info(rasters: tuple[str, ...], **given: Any) -> None:
     """Tell what geodelreg knows of rasters: grid, pixel size, CRS, footprint, bands, provenance.

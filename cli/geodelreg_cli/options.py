@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -25,6 +26,7 @@ from geodelreg_cli.console import configure_logging
 _Options = TypeVar("_Options")
 
 RUN = "Run"
+FILE = click.Path(path_type=Path)
 TYPES = {"str": click.STRING, "int": click.INT, "float": click.FLOAT, "bool": click.BOOL}
 # What follows a flag that may be repeated, unless it is KEY=VALUE.
 METAVARS = {"masks": "FILE[=HIDE]", "pan_masks": "FILE[=HIDE]"}
@@ -66,16 +68,26 @@ GCP_FORMAT = click.Choice(
 
 
 class SectionOption(click.Option):
-    """An option that is listed under a heading of its own in the help."""
+    """An option that is listed under a heading of its own in the help, set by `under`."""
 
-    def __init__(self, *args: Any, section: str = "Options", **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.section = section
+    section = "Options"
 
 
-def flag(*names: str, section: str, **kwargs: Any) -> SectionOption:
-    """An option by its names, under a heading."""
-    return SectionOption(names, section=section, **kwargs)
+def option(*names: str, **kwargs: Any) -> SectionOption:
+    """An option with a value."""
+    return SectionOption(names, **kwargs)
+
+
+def flag(*names: str, **kwargs: Any) -> SectionOption:
+    """An option that is given or not."""
+    return SectionOption(names, is_flag=True, **kwargs)
+
+
+def under(section: str, *options: SectionOption) -> list[SectionOption]:
+    """Options that the help lists under one heading."""
+    for one in options:
+        one.section = section
+    return list(options)
 
 
 class SectionCommand(click.Command):
@@ -99,7 +111,7 @@ class SectionCommand(click.Command):
             formatter.write(inspect.cleandoc(self.epilog) + "\n")
 
 
-def knob_option(options: type, knob: str, section: str) -> SectionOption:
+def knob_option(options: type, knob: str) -> SectionOption:
     """Click option of one knob.
 
     Parameters
@@ -108,16 +120,9 @@ def knob_option(options: type, knob: str, section: str) -> SectionOption:
         `AlignOptions` or `WriteOptions`.
     knob : str
         Name of its field.
-    section : str
-        Heading in the help.
     """
-    field = field_of(options, knob)
-    return SectionOption(
-        [knob, *flags(knob)],
-        section=section,
-        help=as_typed(knob_help(options, knob)),
-        **_kind(field),
-    )
+    text = as_typed(knob_help(options, knob))
+    return option(knob, *flags(knob), help=text, **_kind(field_of(options, knob)))
 
 
 def _kind(field: Field[Any]) -> dict[str, Any]:
@@ -145,37 +150,37 @@ def _kind(field: Field[Any]) -> dict[str, Any]:
     }
 
 
-def knob_options(options: type, section: str, without: Collection[str] = ()) -> list[SectionOption]:
+def knob_options(options: type, without: Collection[str]) -> list[SectionOption]:
     """Click options of all knobs but some."""
-    names = [field.name for field in fields(options) if field.name not in without]
-    return [knob_option(options, name, section) for name in names]
+    return [knob_option(options, one.name) for one in fields(options) if one.name not in without]
 
 
-def run_options() -> list[SectionOption]:
-    """Options that every long-running command has: resources, GDAL's settings, messages."""
+def message_options() -> list[SectionOption]:
+    """Options that every command has."""
     return [
-        knob_option(AlignOptions, "threads", RUN),
-        knob_option(AlignOptions, "allow", RUN),
-        SectionOption(
-            ["--config"],
-            nargs=2,
-            multiple=True,
-            metavar="KEY VALUE",
-            section=RUN,
-            help="Configuration option of GDAL. May be repeated.",
-        ),
-        SectionOption(["-q", "--quiet"], is_flag=True, section=RUN, help="Print errors only."),
-        SectionOption(
-            ["-v", "--verbose"], count=True, section=RUN, help="Print the steps; -vv everything."
-        ),
-        SectionOption(
-            ["--debug"], is_flag=True, section=RUN, help="Print a traceback with an error."
-        ),
+        flag("-q", "--quiet", help="Print errors only."),
+        option("-v", "--verbose", count=True, help="Print the steps; -vv everything."),
+        flag("--debug", help="Print a traceback with an error."),
     ]
 
 
+def run_options(threads: bool = True) -> list[SectionOption]:
+    """Options that every long-running command has: resources, GDAL's settings, messages."""
+    config = option(
+        "--config",
+        nargs=2,
+        multiple=True,
+        metavar="KEY VALUE",
+        help="Configuration option of GDAL. May be repeated.",
+    )
+    knobs = ["threads", "allow"] if threads else ["allow"]
+    return under(
+        RUN, *(knob_option(AlignOptions, name) for name in knobs), config, *message_options()
+    )
+
+
 def start_run(given: Mapping[str, Any]) -> None:
-    """Put the values of `run_options` to work: messages, and GDAL's settings.
+    """Put the values of `run_options` to work, as far as a command has them.
 
     Raises
     ------
@@ -186,15 +191,15 @@ def start_run(given: Mapping[str, Any]) -> None:
     # BLAS, not loaded yet: its threads spin while they wait, so that on a busy machine the fit of
     # a field took minutes; matrices of some hundred points gain nothing from them
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for key, value in given["config"]:
+    for key, value in given.get("config", ()):
         try:
             os.environ[key] = value  # where GDAL, not loaded yet, looks its options up
         except ValueError as error:
             raise click.UsageError(f"--config {key} {value}: {error}") from error
-    keep_to(given["allow"])
+    _keep_to(given["allow"])
 
 
-def keep_to(allow: str) -> None:
+def _keep_to(allow: str) -> None:
     """Take formats that can reach further out of GDAL, which is not loaded yet."""
     from geodelreg.door.formats import skip_the_rest
     from geodelreg.door.names import ALL
@@ -220,12 +225,15 @@ def ms_and_pan(rasters: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
     return rasters[:-1], rasters[-1]
 
 
-def add_options(options: Iterable[SectionOption]) -> Callable[[click.Command], click.Command]:
-    """Decorator that appends options to a command."""
+def command(
+    epilog: str, options: Iterable[SectionOption]
+) -> Callable[[Callable[..., Any]], click.Command]:
+    """Decorator that makes a command of a function, with options after its arguments."""
 
-    def decorate(command: click.Command) -> click.Command:
-        command.params.extend(options)
-        return command
+    def decorate(function: Callable[..., Any]) -> click.Command:
+        made = click.command(cls=SectionCommand, epilog=epilog)(function)
+        made.params.extend(options)
+        return made
 
     return decorate
 

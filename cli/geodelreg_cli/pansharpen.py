@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,24 +10,25 @@ import click
 from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions
 from geodelreg.sharpen_options import PansharpenOptions
-from geodelreg_cli.console import log_steps, progress_bar
+from geodelreg_cli.console import log_steps, progress_bar, warn
 from geodelreg_cli.options import (
-    SectionCommand,
-    SectionOption,
-    add_options,
+    FILE,
     build,
+    command,
+    flag,
     is_default,
     knob_option,
     knob_options,
     ms_and_pan,
+    option,
     run_options,
     start_run,
+    under,
 )
 
 if TYPE_CHECKING:
-    from geodelreg.values.result import Alignment
+    from geodelreg.alignment import Alignment
 
-OUTPUT, SHARPENING, CORRECTION = "Output", "How to sharpen", "How to align"
 WITHOUT = ("threads", "allow", "ms_nodata", "pan_nodata", "agreeing_bands")
 WRITTEN = ("overwrite", "driver", "creation_options")
 
@@ -52,32 +51,30 @@ Exit codes: 0 done, 1 failed, 2 wrong usage, 3 alignment refused (nothing is wri
 """
 
 
-def pansharpen_params() -> list[SectionOption]:
-    """Options of ``pansharpen``, in the order of the help."""
-    return [
-        SectionOption(
-            ["-o", "--output"],
-            type=click.Path(path_type=Path),
+OPTIONS = [
+    *under(
+        "Output",
+        option(
+            "-o",
+            "--output",
+            type=FILE,
             required=True,
             metavar="OUT",
-            section=OUTPUT,
             help="Sharpened raster on PAN's grid: GeoTIFF, COG or VRT.",
         ),
-        *(knob_option(PansharpenOptions, name, OUTPUT) for name in WRITTEN),
-        *knob_options(PansharpenOptions, SHARPENING, without=WRITTEN),
-        SectionOption(
-            ["--no-align"],
-            is_flag=True,
-            section=CORRECTION,
-            help="Take MS where its header puts it, as after geodelreg align.",
-        ),
-        *knob_options(AlignOptions, CORRECTION, without=WITHOUT),
-        *run_options(),
-    ]
+        *(knob_option(PansharpenOptions, name) for name in WRITTEN),
+    ),
+    *under("How to sharpen", *knob_options(PansharpenOptions, without=WRITTEN)),
+    *under(
+        "How to align",
+        flag("--no-align", help="Take MS where its header puts it, as after geodelreg align."),
+        *knob_options(AlignOptions, without=WITHOUT),
+    ),
+    *run_options(),
+]
 
 
-@add_options(pansharpen_params())
-@click.command(cls=SectionCommand, epilog=EPILOG)
+@command(EPILOG, OPTIONS)
 @click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
 def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     """Sharpen MS with PAN on the exact grid of PAN, after aligning it.
@@ -104,15 +101,14 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
         if is_default("on_local") and sharpened_driver(given["output"], options) != "VRT":
             align_options = replace(align_options, on_local="field")
         check_sharpenable(sources, reference, given["output"], options, align_options)
-    source = sources[0] if len(sources) == 1 else sources
     alignment: Alignment | None = None
     with progress_bar(given["quiet"]) as bar:
         step, parts = log_steps(bar), 1 if given["no_align"] else 2
         if not given["no_align"]:
             aligning = part_of(step, 0, parts)
-            alignment = geodelreg.align(source, reference, align_options, progress=aligning)
+            alignment = geodelreg.align(sources, reference, align_options, progress=aligning)
         geodelreg.pansharpen(
-            source,
+            sources,
             reference,
             given["output"],
             options,
@@ -121,9 +117,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
             pan_band=(alignment.options if alignment else align_options).pan_band,
             progress=part_of(step, parts - 1, parts),
         )
-    for warning in alignment.warnings if alignment else ():
-        logging.getLogger(__name__).warning("warning: %s", warning)
-    if alignment is not None and not given["quiet"]:
-        from geodelreg.product.report import summary_text
-
-        click.echo(as_typed(summary_text(alignment)), err=True)
+    if alignment is not None:
+        warn(alignment.warnings)
+        if not given["quiet"]:
+            click.echo(as_typed(alignment.summary()), err=True)

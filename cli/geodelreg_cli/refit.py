@@ -9,24 +9,24 @@ import click
 
 from geodelreg.options import AlignOptions, WriteOptions
 from geodelreg_cli.options import (
+    FILE,
     GCP_FORMAT,
-    SectionCommand,
-    SectionOption,
-    add_options,
     build,
+    command,
     flag,
     knob_option,
     knob_options,
+    option,
     run_options,
     start_run,
+    under,
 )
-from geodelreg_cli.results import output_params, request_of, run
+from geodelreg_cli.results import output_options, request_of, run
 
 if TYPE_CHECKING:
     from geodelreg.alignment import Alignment
     from geodelreg.pair import Progress
 
-FIT, FORMAT = "How to fit", "How OUT is written"
 KNOBS = (
     "model", "north_up", "tolerance_px", "max_shift_px", "max_rotation_deg", "max_scale",
     "band", "pan_band", "masks", "pan_masks", "ms_nodata", "pan_nodata",
@@ -50,33 +50,28 @@ Exit codes: 0 done, 1 failed, 2 wrong usage, 3 refused (nothing written, the rea
 """
 
 
-def refit_params() -> list[SectionOption]:
-    """Options of ``refit``, in the order of the help."""
-    return [
-        *output_params(),
+FROM = option(
+    "--from", "from_format", type=GCP_FORMAT, help="Format of POINTS, if not by extension."
+)
+OPTIONS = [
+    *output_options(),
+    *under(
+        "How to fit",
         flag(
             "--snap",
-            is_flag=True,
-            section=FIT,
             help="Measure points that were drawn, added or moved by hand, by matching what is "
             "around them in MS and PAN. Needs PAN.",
         ),
-        flag(
-            "--from",
-            "from_format",
-            type=GCP_FORMAT,
-            section=FIT,
-            help="Format of POINTS, if not by extension.",
-        ),
-        *(knob_option(AlignOptions, name, FIT) for name in KNOBS),
-        *knob_options(WriteOptions, FORMAT, without=["overwrite"]),
-        *run_options(),
-    ]
+        FROM,
+        *(knob_option(AlignOptions, name) for name in KNOBS),
+    ),
+    *under("How OUT is written", *knob_options(WriteOptions, without=["overwrite"])),
+    *run_options(),
+]
 
 
-@add_options(refit_params())
-@click.command(cls=SectionCommand, epilog=EPILOG)
-@click.argument("file", metavar="POINTS", type=click.Path(path_type=Path))
+@command(EPILOG, OPTIONS)
+@click.argument("file", metavar="POINTS", type=FILE)
 @click.argument("source", metavar="MS")
 @click.argument("reference", metavar="[PAN]", required=False)
 def refit(file: Path, source: str, reference: str | None, **given: Any) -> None:
@@ -93,8 +88,7 @@ def refit(file: Path, source: str, reference: str | None, **given: Any) -> None:
     request = request_of((source,), reference, given, build(AlignOptions, given), file)
     if given["snap"] and reference is None:
         raise click.UsageError("--snap measures points on PAN: name PAN, the last argument.")
-
-    if reference is None and (request.figure or any(map(is_page, request.reports))):
+    if reference is None and (request.figure or any(map(is_page, request.report))):
         raise click.UsageError("--figure and pages show MS on PAN: name PAN, the last argument.")
 
     def find(progress: Progress) -> Alignment:

@@ -9,17 +9,16 @@ import click
 
 from geodelreg.options import WriteOptions
 from geodelreg_cli.options import (
-    SectionCommand,
+    FILE,
     SectionOption,
-    add_options,
+    command,
     knob_option,
     ms_and_pan,
+    option,
     run_options,
     start_run,
+    under,
 )
-
-OUTPUT = "Output"
-FILE = click.Path(path_type=Path)
 
 EPILOG = """\
 Examples:
@@ -33,20 +32,11 @@ Examples:
 """
 
 
-def again_options(metavar: str, help_text: str) -> list[SectionOption]:
+def again_options(*own: SectionOption, **output: str) -> list[SectionOption]:
     """Options of the commands that take a result and its rasters once more."""
-    return [
-        SectionOption(
-            ["-o", "--output"],
-            type=FILE,
-            required=True,
-            metavar=metavar,
-            section=OUTPUT,
-            help=help_text,
-        ),
-        knob_option(WriteOptions, "overwrite", OUTPUT),
-        *(option for option in run_options() if option.name != "threads"),
-    ]
+    target = option("-o", "--output", type=FILE, required=True, **output)
+    overwrite = knob_option(WriteOptions, "overwrite")
+    return [*under("Output", *own, target, overwrite), *run_options(threads=False)]
 
 
 def check_output(result: Path, rasters: tuple[str, ...], given: dict[str, Any]) -> None:
@@ -58,8 +48,12 @@ def check_output(result: Path, rasters: tuple[str, ...], given: dict[str, Any]) 
     check_targets(inputs, [given["output"]], given["overwrite"])
 
 
-@add_options(again_options("FILE.html", "The page: one file, which needs no network; - is stdout."))
-@click.command(cls=SectionCommand, epilog=EPILOG)
+OPTIONS = again_options(
+    metavar="FILE.html", help="The page: one file, which needs no network; - is stdout."
+)
+
+
+@command(EPILOG, OPTIONS)
 @click.argument("result", metavar="RESULT.json", type=FILE)
 @click.argument("rasters", metavar="MS... PAN", nargs=-1, required=True)
 def report(result: Path, rasters: tuple[str, ...], **given: Any) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,40 +13,45 @@ from geodelreg.errors import AlignmentRefusedError, UsageError, shown
 from geodelreg.flags import as_typed
 from geodelreg.masking import parse_mask
 from geodelreg.options import AlignOptions, WriteOptions, check_header_holds
-from geodelreg_cli.console import log_steps, log_timings, progress_bar
+from geodelreg_cli.console import log_steps, log_timings, progress_bar, warn
 from geodelreg_cli.figure import kind_option
-from geodelreg_cli.options import GCP_FORMAT, SectionOption, build, flag, knob_option
+from geodelreg_cli.options import (
+    FILE,
+    GCP_FORMAT,
+    SectionOption,
+    build,
+    flag,
+    knob_option,
+    option,
+    under,
+)
 
 if TYPE_CHECKING:
     from geodelreg.pair import Progress
     from geodelreg.values.result import Alignment
 
-OUTPUT = "Output"
-FILE = click.Path(path_type=Path)
-
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the user asked for, checked for contradictions."""
+    """What the user asked for, checked for contradictions; options are called as in the help."""
 
     sources: tuple[str, ...]
     reference: str | None
+    points_file: Path | None
+    options: AlignOptions
+    write_options: WriteOptions
     output: Path | None
     in_place: bool
-    dry_run: bool
     gcps: tuple[Path, ...]
     gcp_format: str | None
     points: str
-    reports: tuple[Path, ...]
+    report: tuple[Path, ...]
     displacement: Path | None
     figure: Path | None
     figure_kind: str
-    candidate: Path | None
+    keep_candidate: Path | None
     json: bool
     quiet: bool
-    options: AlignOptions
-    write_options: WriteOptions
-    points_file: Path | None = None
 
     @property
     def read_beside(self) -> list[str]:
@@ -56,94 +60,80 @@ class Request:
         return [str(name) for name in names if name is not None]
 
 
-def output_params() -> list[SectionOption]:
+def output_options() -> list[SectionOption]:
     """Options that say what is written."""
-    return [
-        flag(
+    return under(
+        "Output",
+        option(
             "-o",
             "--output",
             type=FILE,
             metavar="OUT",
-            section=OUTPUT,
             help="Corrected MS raster; with several MS files, the folder for them: all or none of "
             "them appear.",
         ),
         flag(
             "--in-place",
-            is_flag=True,
-            section=OUTPUT,
             help="Correct the header of MS itself, whatever its size (of all MS files or none); "
             "keeps a record to undo it.",
         ),
-        flag(
-            "--dry-run",
-            is_flag=True,
-            section=OUTPUT,
-            help="Find and report the correction, write no raster.",
-        ),
-        knob_option(WriteOptions, "overwrite", OUTPUT),
-        flag(
+        flag("--dry-run", help="Find and report the correction, write no raster."),
+        knob_option(WriteOptions, "overwrite"),
+        option(
             "--gcps",
             type=FILE,
             multiple=True,
             metavar="FILE",
-            section=OUTPUT,
             help="Write the tie points as ground control points; the format follows the extension: "
             ".points QGIS, .txt gdal_translate --optfile, .csv gdal raster edit, .geojson, .gpkg, "
             ".fgb, .vrt, .pts ENVI; - writes to stdout. May be repeated.",
         ),
-        flag(
+        option(
             "--gcp-format",
             type=GCP_FORMAT,
-            section=OUTPUT,
             help="Format of --gcps, when the extension does not say it.",
         ),
-        flag(
+        option(
             "--points",
             type=click.Choice(("kept", "all")),
             default="kept",
             show_default=True,
-            section=OUTPUT,
             help="Tie points in --gcps; all has the rejected ones, too (QGIS, "
             "GeoJSON, GeoPackage, FlatGeobuf).",
         ),
-        flag(
+        option(
             "--report",
             type=FILE,
             multiple=True,
             metavar="FILE",
-            section=OUTPUT,
             help="Write everything that was found out; also after a refusal. .html is a page to "
             "look at, with before and after (needs the report extra); else JSON. - writes JSON to "
             "stdout. May be repeated.",
         ),
-        flag(
+        option(
             "--displacement",
             type=FILE,
             metavar="FILE.tif",
-            section=OUTPUT,
             help="Write how far every place moves, as a GeoTIFF: metres east and north, PAN pixels "
             "right and down, standard error.",
         ),
-        flag(
+        option(
             "--figure",
             type=FILE,
             metavar="FILE.png",
-            section=OUTPUT,
             help="Draw the result as PNG, SVG or PDF; also after a refusal (needs matplotlib, the "
             "report extra). - is stdout.",
         ),
-        kind_option("--figure-kind", OUTPUT),
-        flag(
+        kind_option("--figure-kind"),
+        option(
             "--keep-candidate",
             type=FILE,
             metavar="FOLDER",
-            section=OUTPUT,
             help="When refused, keep what was refused there: correction, tie points and figure, in "
             "files named refused_candidate.",
         ),
-        flag("--json", is_flag=True, section=OUTPUT, help="Print the report on stdout."),
-    ]
+        flag("--json", help="Print the report on stdout."),
+    )
 
 
 def request_of(
@@ -174,26 +164,8 @@ def request_of(
         check_header_holds("field" if options.on_local == "field" else options.model)
     if given["gcp_format"] is not None and not given["gcps"]:
         raise click.UsageError("--gcp-format needs --gcps FILE.")
-    return Request(
-        sources=sources,
-        reference=reference,
-        output=given["output"],
-        in_place=given["in_place"],
-        dry_run=given["dry_run"],
-        gcps=given["gcps"],
-        gcp_format=given["gcp_format"],
-        points=given["points"],
-        reports=given["report"],
-        displacement=given["displacement"],
-        figure=given["figure"],
-        figure_kind=given["figure_kind"],
-        candidate=given["keep_candidate"],
-        json=given["json"],
-        quiet=given["quiet"],
-        options=options,
-        write_options=write_options,
-        points_file=points_file,
-    )
+    asked = {one.name: given[one.name] for one in fields(Request) if one.name in given}
+    return Request(sources, reference, points_file, options, write_options, **asked)
 
 
 def carries_all(options: WriteOptions) -> bool:
@@ -219,7 +191,7 @@ def check_outputs(request: Request) -> list[Path]:
     moves = request.displacement
     if moves == STDOUT:
         raise click.UsageError("--displacement -: a raster cannot be written to standard output.")
-    side_files = [path for path in (*request.gcps, *request.reports, moves, request.figure) if path]
+    side_files = [path for path in (*request.gcps, *request.report, moves, request.figure) if path]
     masks = (*request.options.masks, *request.options.pan_masks)
     named = [*request.sources, *request.read_beside]
     inputs = [*named, *(parse_mask(mask).path for mask in masks)]
@@ -237,12 +209,15 @@ def check_outputs(request: Request) -> list[Path]:
             request.output if len(request.sources) > 1 or apart else None,
             rasters,
         )
-        if request.candidate is not None:
+        if request.keep_candidate is not None:
             from geodelreg.report.candidate import candidate_files
 
-            kept, overwrite = candidate_files(request.candidate), request.write_options.overwrite
-            check_targets([*inputs, *map(str, written)], kept, overwrite, request.candidate)
-        for path in request.reports:
+            kept, overwrite = (
+                candidate_files(request.keep_candidate),
+                request.write_options.overwrite,
+            )
+            check_targets([*inputs, *map(str, written)], kept, overwrite, request.keep_candidate)
+        for path in request.report:
             check_report(path)
         if request.figure is not None:
             from geodelreg.product.figures import check_drawable
@@ -294,14 +269,14 @@ def run(request: Request, find: Callable[[Progress], Alignment]) -> None:
 
 
 def _keep_candidate(alignment: Alignment, request: Request) -> None:
-    if request.candidate is None:
+    if request.keep_candidate is None:
         return
     from geodelreg.report.candidate import has_candidate, write_candidate
 
     if not has_candidate(alignment):
-        logging.getLogger(__name__).warning("warning: nothing was found that could be kept")
+        warn(["nothing was found that could be kept"])
         return
-    files = write_candidate(alignment, request.candidate, request.write_options.overwrite)
+    files = write_candidate(alignment, request.keep_candidate, request.write_options.overwrite)
     if not request.quiet:
         click.echo(shown(f"Kept, though refused: {', '.join(map(str, files))}"), err=True)
 
@@ -317,7 +292,7 @@ def _named(request: Request) -> str:
 def _written(request: Request) -> str:
     """The outputs, in one line."""
     paths = [
-        request.output, *request.gcps, *request.reports, request.displacement, request.figure
+        request.output, *request.gcps, *request.report, request.displacement, request.figure
     ]  # fmt: skip
     names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
     if request.in_place:
@@ -342,10 +317,9 @@ def _write(alignment: Alignment, request: Request) -> None:
         warnings = geodelreg.write_in_place(alignment)
     elif request.output is not None:
         warnings = geodelreg.write(alignment, request.output, request.write_options)
-    for warning in (*alignment.warnings, *warnings):
-        if warning == ROTATES and carries_all(request.write_options):
-            continue  # OUT is resampled, or has control points
-        logging.getLogger(__name__).warning("warning: %s", warning)
+    # of no meaning where OUT is resampled, or has control points
+    silent = {ROTATES} if carries_all(request.write_options) else set()
+    warn(text for text in (*alignment.warnings, *warnings) if text not in silent)
     if request.displacement is not None:
         geodelreg.write_displacement(alignment, request.displacement, overwrite)
     for path in request.gcps:
@@ -366,7 +340,7 @@ def _reports(alignment: Alignment, request: Request) -> list[tuple[Path, str]]:
     from geodelreg.geotiff.targets import STDOUT
     from geodelreg.report.output import report_text
 
-    paths = [*request.reports, *([STDOUT] if request.json else [])]
+    paths = [*request.report, *([STDOUT] if request.json else [])]
     return [(path, report_text(alignment, path)) for path in paths]
 
 
