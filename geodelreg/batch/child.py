@@ -105,10 +105,8 @@ def run_task(task: Task) -> tuple[PairResult, bool]:
     bool
         False when the process had better not be used again.
     """
-    pair, start, healthy = task.pair, perf_counter(), True
-    result = PairResult(
-        task.number, pair.sources, pair.reference, pair.output, FAILED, host=platform.node()
-    )
+    start, healthy = perf_counter(), True
+    result = PairResult.of(task.number, task.pair, FAILED, host=platform.node())
     with _logged_warnings() as logged:
         try:
             result = _RUN[task.mode](task, result)
@@ -147,8 +145,7 @@ def _align(task: Task, result: PairResult) -> PairResult:
 
     pair = task.pair
     options = AlignOptions(**pair.align, threads=1)
-    alignment = geodelreg.align(pair.sources if len(pair.sources) > 1 else pair.sources[0],
-                                pair.reference, options)  # fmt: skip
+    alignment = geodelreg.align(pair.sources, pair.reference, options)
     result = _with_alignment(result, alignment)
     _write_page(task, alignment)  # of the inputs as they are
     tags = provenance_tags(alignment)
@@ -196,13 +193,8 @@ def _check(task: Task, result: PairResult) -> PairResult:
     from geodelreg.batch.figures import check_figures
     from geodelreg.options import AlignOptions
 
-    pair = task.pair
-    check = geodelreg.check(
-        pair.sources if len(pair.sources) > 1 else pair.sources[0],
-        pair.reference,
-        AlignOptions(**pair.align, threads=1),
-        limit_px=task.limit_px,
-    )
+    options = AlignOptions(**task.pair.align, threads=1)
+    check = geodelreg.check(task.pair.sources, task.pair.reference, options, limit_px=task.limit_px)
     result = _with_alignment(result, check.alignment)
     _write_page(task, check.alignment, check)
     figures = {**result.figures, **check_figures(check.misalignment)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 from collections import Counter, deque
@@ -108,7 +109,8 @@ class Batch:
         for path in self._tables:
             check_format(path)
         self._environment = _environment(align, config or {})
-        source, root = _source(manifest), _root(manifest, out_root)
+        source = _source(manifest)
+        root = Path(out_root) if out_root is not None else source.parent if source else Path()
         self.path = ledger_path(manifest, ledger, out_root)
         going_on = (resume or bool(self._retry)) and self.path.exists()
         wal = [Path(f"{self.path}{suffix}") for suffix in ("-wal", "-shm")]
@@ -116,7 +118,7 @@ class Batch:
             name=str(source or "the list of pairs"),
             folder=(source.parent if source else Path()).absolute(),
             out_root=root.absolute(),
-            mode=self._mode(),
+            mode=CHECK if self._options.check else IN_PLACE if self._options.in_place else ALIGN,
             align=align,
             write=write or WriteOptions(),
             reserved=(*([source] if source else []), self.path, *wal, *self._tables),
@@ -124,11 +126,6 @@ class Batch:
         )
         self._going_on = going_on
         self.counts: Counter[str] = Counter()
-
-    def _mode(self) -> str:
-        if self._options.check:
-            return CHECK
-        return IN_PLACE if self._options.in_place else ALIGN
 
     def pairs(self) -> Iterator[Pair]:
         """The pairs, checked; see `checked_pairs` for what it raises, and when."""
@@ -224,12 +221,12 @@ class Batch:
         under_way: dict[Future[str], tuple[int, Pair]] = {}
         finished: queue.SimpleQueue[Future[str]] = queue.SimpleQueue()
         losses: Counter[int] = Counter()
-        room, looked = workers.at_once, monotonic()
+        looked = -math.inf
         while True:
             if monotonic() - looked > _LOOK_S:
                 workers.check()
-                room, looked = workers.at_once, monotonic()
-            while len(under_way) < room:
+                looked = monotonic()
+            while len(under_way) < workers.at_once:
                 number, pair = again.popleft() if again else next(todo, (0, None))
                 if pair is None:
                     break
@@ -295,9 +292,9 @@ class Batch:
         cause = PairCrashedError(
             f"{losses[number]} workers were lost that had it", "Look at the logs of the workers."
         )
-        return PairResult(
-            number, pair.sources, pair.reference, pair.output, FAILED,
-            type(cause).__name__, str(cause), attempts=losses[number],
+        return PairResult.of(
+            number, pair, FAILED,
+            error=type(cause).__name__, reason=str(cause), attempts=losses[number],
         )  # fmt: skip
 
 
@@ -329,11 +326,6 @@ def _source(manifest: Manifest) -> Path | None:
     return Path(manifest) if isinstance(manifest, str | PathLike) else None
 
 
-def _root(manifest: Manifest, out_root: AnyPath | None) -> Path:
-    source = _source(manifest)
-    return Path(out_root) if out_root is not None else source.parent if source else Path()
-
-
 def ledger_path(
     manifest: Manifest, ledger: AnyPath | None = None, out_root: AnyPath | None = None
 ) -> Path:
@@ -343,7 +335,7 @@ def ledger_path(
         return Path(ledger)
     if source is not None:
         return source.with_name(source.stem + ".ledger")
-    return _root(manifest, out_root) / "batch.ledger"
+    return Path(out_root or ".", "batch.ledger")
 
 
 def _known_outcomes(names: Iterable[str]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 from geodelreg.batch.supervisor import Children, run_pair
 from geodelreg.errors import ClusterError, MissingExtraError
@@ -19,58 +19,17 @@ _PER_THREAD = 4
 _RESUME = "Once it runs, go on with `resume=True`: what is finished is not repeated."
 
 
-class Workers(Protocol):
-    """Who runs pairs."""
+class Workers:
+    """Any executor; whoever made it ends it, and a broken one says so with the futures.
 
-    @property
-    def at_once(self) -> int:
-        """Pairs that are worth having under way."""
+    Attributes
+    ----------
+    at_once : int
+        Pairs that are worth having under way.
+    """
 
-    def submit(self, text: str) -> Future[str]:
-        """Let a task run."""
-
-    def check(self) -> None:
-        """Raise `ClusterError` when the workers are lost for good."""
-
-    def close(self) -> None:
-        """Let go of them; what is under way is not waited for."""
-
-
-class LocalWorkers:
-    """Threads of this process, with a child each."""
-
-    def __init__(self, count: int) -> None:
-        self.at_once = count or _cores()
-        self._children = Children()
-        self._threads = ThreadPoolExecutor(self.at_once, thread_name_prefix="pair")
-
-    def submit(self, text: str) -> Future[str]:
-        """Let a task run."""
-        return self._threads.submit(self._children.run, text)
-
-    def check(self) -> None:
-        """Threads are not lost."""
-
-    def close(self) -> None:
-        """End the children."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        self._children.stop()
-        self._threads.shutdown(wait=True)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    allowed = getattr(os, "sched_getaffinity", None)
-    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
-
-
-class ExecutorWorkers:
-    """Any executor; whoever made it ends it."""
-
-    def __init__(self, executor: Executor, count: int) -> None:
-        known = getattr(executor, "_max_workers", None)
-        self.at_once = count or 2 * (known if isinstance(known, int) else os.cpu_count() or 1)
-        self._executor = executor
+    def __init__(self, executor: Executor, at_once: int) -> None:
+        self._executor, self.at_once = executor, at_once
 
     def submit(self, text: str) -> Future[str]:
         """Let a task run."""
@@ -80,53 +39,62 @@ class ExecutorWorkers:
             raise ClusterError(f"the executor takes no more pairs ({error})", _RESUME) from error
 
     def check(self) -> None:
-        """A broken executor says so with the futures."""
+        """Raise `ClusterError` when the workers are lost for good."""
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Let go of them; what is under way is not waited for."""
 
 
-class DaskWorkers:
-    """A cluster of Dask, through its client."""
+class LocalWorkers(Workers):
+    """Threads of this process, with a child each."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(ThreadPoolExecutor(count, thread_name_prefix="pair"), count)
+        self._children = Children()
+
+    def submit(self, text: str) -> Future[str]:
+        """Let a task run."""
+        return self._executor.submit(self._children.run, text)
+
+    def close(self) -> None:
+        """End the children."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._children.stop()
+        self._executor.shutdown(wait=True)
+
+
+class DaskWorkers(Workers):
+    """A cluster of Dask, through its client; without a `count` four pairs for each thread of it."""
 
     def __init__(self, client: Any, count: int, owned: bool = False) -> None:
+        super().__init__(client.get_executor(pure=False, retries=0), count or _PER_THREAD)
         self._client = client
-        self._executor = client.get_executor(pure=False, retries=0)
-        self._count = count
+        self._grows = not count
         self._owned = owned
         self._alone = False
-
-    @property
-    def at_once(self) -> int:
-        """Four pairs for each thread that the cluster has now; it may grow and shrink."""
-        if self._count:
-            return self._count
-        return max(_PER_THREAD * self._threads_there(), _PER_THREAD)
-
-    def _threads_there(self) -> int:
-        """Threads of all workers; a scheduler that ends meanwhile resets the connection."""
-        try:
-            return int(sum(self._client.nthreads().values()))
-        except OSError as error:  # a timeout and Dask's CommClosedError are such, too
-            raise ClusterError(
-                f"the connection to Dask's scheduler is lost ({error})", _RESUME
-            ) from error
 
     def submit(self, text: str) -> Future[str]:
         """Let a task run."""
         try:
-            future: Future[str] = self._executor.submit(run_pair, text)
+            return self._executor.submit(run_pair, text)
         except Exception as error:
             raise ClusterError(f"the cluster takes no more pairs ({error})", _RESUME) from error
-        return future
 
     def check(self) -> None:
-        """A client whose scheduler is gone is not running."""
+        """See that the scheduler is there, and how many threads the cluster has now."""
         if self._client.status != "running":
             raise ClusterError(
                 f"the connection to Dask's scheduler is {self._client.status}", _RESUME
             )
-        if not (self._threads_there() or self._alone):
+        try:
+            threads = int(sum(self._client.nthreads().values()))
+        except OSError as error:  # a timeout and Dask's CommClosedError are such, too
+            raise ClusterError(
+                f"the connection to Dask's scheduler is lost ({error})", _RESUME
+            ) from error
+        if self._grows:
+            self.at_once = _PER_THREAD * max(threads, 1)
+        if not (threads or self._alone):
             self._alone = True
             logger.warning("the cluster has no workers now; the pairs wait for some")
 
@@ -135,6 +103,12 @@ class DaskWorkers:
         self._executor.shutdown(wait=False)
         if self._owned:
             self._client.close()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
 def workers_of(executor: Any, count: int) -> Workers:
@@ -155,9 +129,11 @@ def workers_of(executor: Any, count: int) -> Workers:
         Nobody answers at the address.
     """
     if executor is None:
-        return LocalWorkers(count)
+        return LocalWorkers(count or _cores())
     if isinstance(executor, Executor):
-        return ExecutorWorkers(executor, count)
+        known = getattr(executor, "_max_workers", None)
+        usual = 2 * (known if isinstance(known, int) else os.cpu_count() or 1)
+        return Workers(executor, count or usual)
     if isinstance(executor, str):
         return DaskWorkers(_connected(executor), count, owned=True)
     return DaskWorkers(executor, count)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 ALIGN, IN_PLACE, CHECK = "align", "in_place", "check"
-MODES = (ALIGN, IN_PLACE, CHECK)
 
 ALIGNED, ALREADY_ALIGNED, REFUSED, FAILED = "aligned", "already_aligned", "refused", "failed"
 MISALIGNED, CANNOT_TELL = "misaligned", "cannot_tell"
@@ -57,12 +56,7 @@ class Pair:
     @classmethod
     def from_json(cls, text: str) -> Pair:
         """Back from `to_json`."""
-        return cls.from_dict(json.loads(text))
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Pair:
-        """Back from the values of its JSON."""
-        return cls(**{**values, "sources": tuple(values["sources"])})
+        return cls(**_with_tuples(json.loads(text)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +69,7 @@ class Task:
         Of the pair in the manifest, from 1.
     pair : Pair
     mode : str
-        One of `MODES`.
+        ``align``, ``in_place`` or ``check``.
     limit_px, timeout_s, memory_mb
         As in `BatchOptions`.
     environment : dict of str to str
@@ -104,7 +98,7 @@ class Task:
     def from_json(cls, text: str) -> Task:
         """Back from `to_json`."""
         values = json.loads(text)
-        return cls(**values | {"pair": Pair.from_dict(values["pair"])})
+        return cls(**values | {"pair": Pair(**_with_tuples(values["pair"]))})
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +145,11 @@ class PairResult:
     attempts: int = 1
     host: str = ""
 
+    @classmethod
+    def of(cls, number: int, pair: Pair, outcome: str, **more: Any) -> PairResult:
+        """That a pair has ended so; `more` are the other fields."""
+        return cls(number, pair.sources, pair.reference, pair.output, outcome, **more)
+
     def to_json(self) -> str:
         """One line of text."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -159,9 +158,12 @@ class PairResult:
     @classmethod
     def from_json(cls, text: str) -> PairResult:
         """Back from `to_json`."""
-        values = json.loads(text)
-        lists = {name: tuple(values[name]) for name in ("sources", "warnings")}
-        return cls(**values | lists)
+        return cls(**_with_tuples(json.loads(text)))
+
+
+def _with_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields as they were before they were JSON."""
+    return {name: tuple(one) if isinstance(one, list) else one for name, one in values.items()}
 
 
 FIGURES = (

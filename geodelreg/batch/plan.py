@@ -34,7 +34,7 @@ class Setting:
     out_root : Path
         Absolute; where relative names of outputs begin, and below which all outputs stay.
     mode : str
-        One of `geodelreg.batch.job.MODES`.
+        ``align``, ``in_place`` or ``check``.
     align, write : as their types say
         Options of pairs that say nothing else.
     reserved : tuple of Path
@@ -110,8 +110,7 @@ def checked_pairs(rows: Iterable[Row], setting: Setting) -> Iterator[Pair]:
             problems.add(row.place, error.cause)
             continue
         yield pair
-    targets.check(inputs)
-    for place, text in targets.problems:
+    for place, text in targets.late_problems(inputs):
         problems.add(place, text)
     if problems.count:
         found = problems.sentences()
@@ -131,7 +130,6 @@ class _Targets:
         self._setting = setting
         self._root = resolved(str(setting.out_root))
         self._places: dict[str, str] = {}
-        self.problems: list[tuple[str, str]] = []
 
     def add(self, target: str, place: str) -> None:
         path = resolved(target)
@@ -149,21 +147,21 @@ class _Targets:
         if self._setting.fresh and not self._setting.write.overwrite and os.path.lexists(path):
             raise UsageError(f"out {target} exists; `overwrite=True` replaces it")
 
-    def check(self, inputs: set[str]) -> None:
-        """What can be told only when all are known."""
+    def late_problems(self, inputs: set[str]) -> Iterator[tuple[str, str]]:
+        """Places and texts of what can be told only when all are known."""
         folders = {""}
         reserved = {resolved(str(path)) for path in self._setting.reserved}
         for path, place in self._places.items():
             if path in inputs:
-                self.problems.append((place, f"{path} is written, and is an input of the batch"))
+                yield place, f"{path} is written, and is an input of the batch"
             if path in reserved:
-                self.problems.append((place, f"{path} is a file of the batch itself"))
+                yield place, f"{path} is a file of the batch itself"
             above = path.rpartition(os.sep)[0]
             while above not in folders:
                 folders.add(above)
                 if above in self._places:
-                    text = f"out {path} lies below {above}, which is the output of "
-                    self.problems.append((place, text + self._places[above]))
+                    first = self._places[above]
+                    yield place, f"out {path} lies below {above}, which is the output of {first}"
                     folders.discard(above)
                     break
                 above = above.rpartition(os.sep)[0]

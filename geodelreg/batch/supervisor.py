@@ -238,49 +238,37 @@ class Children:
                 "Leave `memory_mb` out, or run on Linux.",
             )
         start = monotonic()
-        attempt = 1
-        while True:
+        for attempt in range(1, ATTEMPTS + 1):
+            child = None
             try:
-                result = self._try(task, fresh=attempt > 1)
-            except ClusterError:
-                raise
-            except _FinalError as final:
-                failure = final.error
-                break
-            except GeodelregError as error:
+                child = self._take(task.environment, fresh=attempt > 1)
+                result = child.run(task)
+            except BaseException as error:
+                if child is not None:
+                    self._drop(child)
+                if isinstance(error, ClusterError) or not isinstance(error, GeodelregError):
+                    raise
                 failure = error
-                if attempt == ATTEMPTS:
-                    break
+                if child is None:
+                    continue
             else:
+                self._give_back(child)
                 return replace(result, attempts=attempt).to_json()
-            attempt += 1
+            if self._stopped:
+                failure = ClusterError("the batch was stopped", "Add `resume=True`.")
+            spent = isinstance(failure, PairMemoryError) and child.pairs == 1
+            if spent or isinstance(failure, ClusterError | PairTimeoutError):
+                break  # no further attempt would change it
         tidy_up(task)
         return _failed(task, failure, attempt, monotonic() - start).to_json()
 
-    def _try(self, task: Task, fresh: bool) -> PairResult:
-        child = self._take(task.environment, fresh)
-        try:
-            result = child.run(task)
-        except GeodelregError as error:
+    def _give_back(self, child: Child) -> None:
+        if not child.is_healthy:
             self._drop(child)
-            if self._stopped:
-                raise _FinalError(
-                    ClusterError("the batch was stopped", "Add `resume=True`.")
-                ) from None
-            spent = isinstance(error, PairMemoryError) and child.pairs == 1
-            if spent or isinstance(error, PairTimeoutError):
-                raise _FinalError(error) from None
-            raise
-        except BaseException:
-            self._drop(child)
-            raise
-        if child.is_healthy:
-            with self._lock:
-                self._busy.discard(child)
-                self._idle.append(child)
-        else:
-            self._drop(child)
-        return result
+            return
+        with self._lock:
+            self._busy.discard(child)
+            self._idle.append(child)
 
     def _take(self, environment: Mapping[str, str], fresh: bool) -> Child:
         child = None if fresh else self._waiting(environment)
@@ -317,14 +305,6 @@ class Children:
             child.kill()
 
 
-class _FinalError(Exception):
-    """An ending that no further attempt would change."""
-
-    def __init__(self, error: GeodelregError) -> None:
-        self.error = error
-        super().__init__(error)
-
-
 _shared = Children()
 atexit.register(_shared.stop)
 
@@ -351,18 +331,16 @@ def run_pair(text: str) -> str:
 
 
 def _failed(task: Task, error: GeodelregError, attempts: int, duration_s: float) -> PairResult:
-    pair = task.pair
-    there = [path.name for path in pair.targets if path.exists()]
-    whole = f"{len(there)} of {len(pair.targets)} outputs were written: {', '.join(there)}"
-    return PairResult(
+    targets = task.pair.targets
+    there = [path.name for path in targets if path.exists()]
+    whole = f"{len(there)} of {len(targets)} outputs were written: {', '.join(there)}"
+    return PairResult.of(
         task.number,
-        pair.sources,
-        pair.reference,
-        pair.output,
+        task.pair,
         FAILED,
-        type(error).__name__,
-        f"{error.cause}. {error.remedy}",
-        (whole,) if there else (),
+        error=type(error).__name__,
+        reason=f"{error.cause}. {error.remedy}",
+        warnings=(whole,) if there else (),
         duration_s=duration_s,
         attempts=attempts,
         host=platform.node(),

@@ -28,14 +28,6 @@ _FIGURES = (
     ("sigma_corner_px", "Uncertainty", "Standard error at the worst corner, PAN pixels"),
     ("tie_points", "Tie points", "Tie points kept"),
 )
-_WORDS = {
-    "aligned": "aligned",
-    "already_aligned": "already aligned",
-    "misaligned": "misaligned",
-    "refused": "refused",
-    "cannot_tell": "cannot tell",
-    "failed": "failed",
-}
 _WORST_FIRST = ("failed", "misaligned", "refused", "cannot_tell", "aligned", "already_aligned")
 
 
@@ -93,14 +85,18 @@ def index(rows: Iterable[Row]) -> str:
         ["index.js"],
         total=len(every),
         shown=len(shown),
-        outcomes=[(name, _WORDS[name], counts[name]) for name in _WORST_FIRST if counts[name]],
+        outcomes=[(name, _words(name), counts[name]) for name in _WORST_FIRST if counts[name]],
         figures=known,
         rows=[
-            (row, _WORDS[row.outcome], [_cell(row.figures.get(name)) for name, _, _ in known])
+            (row, _words(row.outcome), [_cell(row.figures.get(name)) for name, _, _ in known])
             for row in shown
         ],
         map=_map(shown),
     )
+
+
+def _words(outcome: str) -> str:
+    return outcome.replace("_", " ")
 
 
 def _cell(value: Any) -> tuple[str, str]:
