@@ -133,7 +133,7 @@ class PointsError(GeodelregError):
 
 
 class ReportError(GeodelregError):
-    """A report or a displacement is none, of another version or a refusal, or of other rasters."""
+    """A report is none, of another version or of a refusal, or of other rasters."""
 
 
 class CorrectionMisfitError(GeodelregError):

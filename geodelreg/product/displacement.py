@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 from affine import Affine
 
-from geodelreg.door.opening import open_raster
-from geodelreg.errors import ReportError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.geo.pixel import pixel_centres
@@ -94,30 +92,3 @@ def displacement(alignment: Alignment, at: FloatArray, metres: FloatArray) -> Fl
     unit = np.hypot(*(wide - one).T)
     sigma_px = np.hypot(sigma * unit, alignment.accuracy.systematic_px if sigma.any() else 0.0)
     return np.column_stack([(after - before) * metres, other - one, sigma_px])
-
-
-def read_displacement(path: Path) -> tuple[FloatArray, Grid]:
-    """Read a displacement that `geodelreg.write_displacement` has written.
-
-    Returns
-    -------
-    moves : (H, W, 2) float64
-        Units of the map, east and north, at pixel centres.
-    grid : Grid
-        Of these pixels.
-
-    Raises
-    ------
-    ReportError
-        It is another raster.
-    RasterNotFoundError, RasterUnreadableError
-    """
-    with open_raster(path) as dataset:
-        metres = [float(text) for text in dataset.tags().get(_METRES, "").split()]
-        if dataset.descriptions != BANDS or len(metres) != 2:
-            raise ReportError(
-                f"{path} is no displacement of geodelreg: its bands are not {', '.join(BANDS)}",
-                "Make one: geodelreg align MS PAN --dry-run --displacement FILE.tif.",
-            )
-        moves = np.moveaxis(dataset.read([1, 2]), 0, -1) / metres
-        return moves, Grid(dataset.transform, dataset.shape, dataset.crs.to_wkt())
