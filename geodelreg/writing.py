@@ -64,8 +64,9 @@ def write(
     from geodelreg.geotiff.corrected import write_corrected
     from geodelreg.geotiff.sidecars import stale_beside
     from geodelreg.geotiff.targets import check_replaceable
+    from geodelreg.product.gcps.lattice import gcps_of_map
     from geodelreg.product.warp import grid_asked, write_warped
-    from geodelreg.writing_bands import bands_by_file, placed_bands
+    from geodelreg.writing_bands import bands_by_file, placed_bands, write_bands
 
     check_accepted(alignment)
     options = replace(options or WriteOptions(), **knobs)
@@ -76,8 +77,6 @@ def write(
             "Refit with PAN, or use `warp_grid='ms'`.",
         )
     if alignment.options.per_band and not options.warp:
-        from geodelreg.writing_bands import write_bands
-
         return write_bands(alignment, Path(target), options)
     if not (options.warp or options.georef == "gcps"):
         _check_header_holds(alignment)
@@ -97,21 +96,15 @@ def write(
             correction, gcps = correction_of_file(alignment, path)
             placement = placement_of(alignment, correction)
             if options.warp:
+                bands = placed_bands(alignment, by_file.get(path, {}), correction)
                 notes += write_warped(
-                    path,
-                    out,
-                    correction,
-                    onto,
-                    tags,
-                    options,
-                    model,
-                    placement,
-                    placed_bands(alignment, by_file.get(path, {}), correction),
+                    path, out, correction, onto, tags, options, model, placement, bands
                 )
-            else:
-                if placement is not None:
-                    gcps = _gcps_of_map(path, placement, allow)
-                notes += write_corrected(path, out, correction, gcps, tags, options)
+                continue
+            if placement is not None:
+                with open_raster(path, allow=allow) as reader:
+                    gcps = gcps_of_map(str(path), placement, reader.grid)
+            notes += write_corrected(path, out, correction, gcps, tags, options)
     return notes
 
 
@@ -133,7 +126,9 @@ def write_in_place(alignment: Alignment) -> list[str]:
     from geodelreg.geotiff.inplace import edit_in_place
 
     check_accepted(alignment)
-    _check_one_header(alignment)
+    if alignment.options.per_band:
+        raise one_header()
+    _check_header_holds(alignment)
     check_is_file(alignment)
     if alignment.verdict.outcome is Outcome.ALREADY_ALIGNED:
         tidy(map(Path, alignment.source.paths))
@@ -144,19 +139,6 @@ def write_in_place(alignment: Alignment) -> list[str]:
         for name in alignment.source.paths:
             notes += edit_in_place(Path(name), *correction_of_file(alignment, Path(name)), tags)
     return notes
-
-
-def _gcps_of_map(path: Path, placement: PixelMap, allow: str) -> tuple[Gcp, ...]:
-    from geodelreg.product.gcps.lattice import gcps_of_map
-
-    with open_raster(path, allow=allow) as reader:
-        return gcps_of_map(str(path), placement, reader.grid)
-
-
-def _check_one_header(alignment: Alignment) -> None:
-    if alignment.options.per_band:
-        raise one_header()
-    _check_header_holds(alignment)
 
 
 def _check_header_holds(alignment: Alignment) -> None:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import os
 import time
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice, takewhile
@@ -320,30 +320,30 @@ def _check_depth(parents: tuple[str, ...]) -> None:
 def _check_opens(source: AnyFile, parent: AnyFile) -> None:
     """Refuse a source that GDAL could only open in a format that needs more."""
     import rasterio
-    from rasterio.errors import RasterioError
     from rasterio.io import DatasetReader
 
-    try:
-        with rasterio.Env():
-            DatasetReader(str(source), driver=list(alone())).close()
-    except (RasterioError, OSError, ValueError, SystemError) as error:
-        raise RasterUnreadableError(
-            f"{source}, a source of {parent}, is not a raster that may be opened ({error})",
-            "Restore it, or build the VRT again.",
-        ) from error
+    with _source(source, parent, "Restore it, or build the VRT again."), rasterio.Env():
+        DatasetReader(str(source), driver=list(alone())).close()
 
 
 def _check_remote(name: str, parent: AnyFile) -> None:
     """Refuse a source on the network that GDAL would not open as one of `BY_SIGNATURE`."""
-    from rasterio.errors import RasterioError
     from rasterio.io import DatasetReader
 
-    try:
+    with _source(name, parent, "Check the address and the access to it, or build the VRT again."):
         without_side_files(lambda: DatasetReader(name, driver=list(BY_SIGNATURE))).close()
+
+
+@contextmanager
+def _source(name: AnyFile | str, parent: AnyFile, remedy: str) -> Iterator[None]:
+    """Opening of a source, with its errors in words."""
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
     except (RasterioError, OSError, ValueError, SystemError) as error:
         raise RasterUnreadableError(
-            f"{name}, a source of {parent}, is not a raster that may be opened ({error})",
-            "Check the address and the access to it, or build the VRT again.",
+            f"{name}, a source of {parent}, is not a raster that may be opened ({error})", remedy
         ) from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -51,7 +52,7 @@ def copy_file(source: Path, target: Path) -> None:
     """
     with (
         open_source(source) as reading,
-        Unchanged(source, reading),
+        unchanged(source, reading),
         target.open("wb", buffering=0) as writing,
     ):
         copy_range(reading, writing, 0, 0, os.fstat(reading.fileno()).st_size)
@@ -130,7 +131,8 @@ def _data_extents(descriptor: int, start: int, end: int) -> Iterator[tuple[int, 
         start = last
 
 
-class Unchanged:
+@contextmanager
+def unchanged(path: Path, file: BinaryIO) -> Iterator[None]:
     """Context in which a file must not change; copying one that does gives neither state.
 
     Raises
@@ -138,19 +140,10 @@ class Unchanged:
     RasterUnreadableError
         On leaving, when it has changed.
     """
-
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file = path, file
-
-    def __enter__(self) -> None:
-        self.before = self._state()
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None and self._state() != self.before:
-            raise RasterUnreadableError(
-                f"{self.path} changed while being read", "Wait until it is complete and try again."
-            )
-
-    def _state(self) -> tuple[int, int]:
-        stat = os.fstat(self.file.fileno())
-        return stat.st_size, stat.st_mtime_ns
+    before = os.fstat(file.fileno())
+    yield
+    after = os.fstat(file.fileno())
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+        raise RasterUnreadableError(
+            f"{path} changed while being read", "Wait until it is complete and try again."
+        )

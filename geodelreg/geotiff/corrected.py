@@ -119,9 +119,7 @@ def _is_copied(source: Path, target: Path, options: WriteOptions) -> bool:
 def _losses(source: Path, out: Path, content: Provenance, copied: bool) -> list[str]:
     lost = compare.metadata_differences(source, out, copied, content.strip_rpc)
     notes = [f"{source.name}: not kept in the output: {what}" for what in lost]
-    with open_raster(out) as dataset:
-        has_rpc = "RPC" in metadata.domains(dataset)
-    if has_rpc:
+    if metadata.has_rpc(out):
         notes.append(
             f"{source.name}: the output keeps RPCs, which do not know the correction; "
             "`strip_rpc=True` drops them"

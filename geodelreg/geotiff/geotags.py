@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from xml.sax.saxutils import escape
 
 from affine import Affine
 
@@ -132,15 +133,11 @@ def _items(domains: Mapping[str, Mapping[str, str]], band: str) -> Iterable[byte
         place = f' domain="{_attribute(domain)}"' if domain else ""
         for name, value in sorted(items.items()):
             # GDAL unescapes twice, once as XML and once more
-            text = _escaped(_escaped(value))
+            text = escape(escape(value))
             yield f'  <Item name="{_attribute(name)}"{band}{place}>{text}</Item>\n'.encode(
                 errors="replace"
             )
 
 
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
 def _attribute(text: str) -> str:
-    return _escaped(text).replace('"', "&quot;")
+    return escape(text, {'"': "&quot;"})

@@ -17,7 +17,7 @@ from html import escape
 from pathlib import Path
 from typing import BinaryIO
 
-from geodelreg.door.opening import open_raster, own_name
+from geodelreg.door.opening import own_name
 from geodelreg.errors import (
     OutputUnwritableError,
     RasterNotFoundError,
@@ -83,7 +83,7 @@ def edit_in_place(
             notes.append(f"{path}: changed by another program since; earlier edits stay for good")
             edits = []
         edit = _planned(path, raster, file, content)
-        if _has_rpc(raster):
+        if metadata.has_rpc(raster):
             notes.append(f"{path}: its RPCs do not know the correction; write to OUT to drop them")
         run.add_edit(raster, [*edits, edit])
     return notes
@@ -261,8 +261,3 @@ def _preview(raster: Path, edit: Edit, header_bytes: int) -> Iterator[str]:
             own_name(f"/vsisparse/{description.name}", "GTiff") as preview,
         ):
             yield preview
-
-
-def _has_rpc(raster: Path) -> bool:
-    with open_raster(raster) as dataset:
-        return "RPC" in metadata.domains(dataset)

@@ -44,6 +44,17 @@ def attribute(dataset: Any, name: str) -> Any:
         return None
 
 
+def descriptions(dataset: Any) -> tuple[str | None, ...]:
+    """What each band is called; None where nothing says it."""
+    return tuple(attribute(dataset, "descriptions") or (None,) * dataset.count)
+
+
+def has_rpc(path: Path) -> bool:
+    """Whether a raster carries RPCs."""
+    with open_raster(path) as dataset:
+        return "RPC" in domains(dataset)
+
+
 def colormap(dataset: Any, band: int) -> Any:
     """Colour table of a band, None without one."""
     try:

@@ -175,7 +175,7 @@ def _tiff_creation(
     user = user_creation(options)
     creation = {"BIGTIFF": "IF_SAFER"}
     with open_raster(source) as dataset:
-        names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
+        names = metadata.descriptions(dataset)
         structure = metadata.tags(dataset, 0, "IMAGE_STRUCTURE")
         has_overviews = bool(dataset.overviews(1))
         inherited = dataset.driver in _TIFF_DRIVERS and is_tiff(source)

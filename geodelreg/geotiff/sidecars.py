@@ -5,7 +5,6 @@ A PAM file overrides the georeferencing inside a TIFF, so that a stale one undoe
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,8 +15,6 @@ from geodelreg.geotiff.copying import copy_file
 
 if TYPE_CHECKING:
     from affine import Affine
-
-logger = logging.getLogger(__name__)
 
 DOMAIN = "GEODELREG"
 """Metadata domain of the GCPs; also the prefix of the provenance tags."""
@@ -169,11 +166,6 @@ def without_placement(pam: bytes, strip_rpc: bool = False) -> bytes | None:
     if not dropped and not provenance:
         return pam
     return _serialise(root) if len(root) else None
-
-
-def has_rpc(pam: bytes) -> bool:
-    """Whether a PAM file holds RPCs."""
-    return any(_is_rpc(child) for child in _parse(pam))
 
 
 def with_metadata(pam: bytes | None, domains: Mapping[str, Mapping[str, str]]) -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from geodelreg.geotiff import relayout
-from geodelreg.geotiff.copying import Unchanged, copy_range, open_source
+from geodelreg.geotiff.copying import copy_range, open_source, unchanged
 from geodelreg.geotiff.durable import write_fully
 from geodelreg.geotiff.header import Georeference, Metadata, Provenance, corrected_entries
 from geodelreg.tiff import (
@@ -19,7 +19,7 @@ from geodelreg.tiff import (
 )
 
 
-def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadata = ()) -> None:
+def copy_with_header(source: Path, out: Path, content: Provenance) -> None:
     """Copy a TIFF, encoded blocks as they are, and give the copy its corrected header.
 
     COGs stay COGs; a file that would outgrow classic TIFF becomes a BigTIFF.
@@ -36,13 +36,13 @@ def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadat
     georeference = Georeference.read(source)
     with (
         open_source(source) as reading,
-        Unchanged(source, reading),
+        unchanged(source, reading),
         out.open("w+b", buffering=0) as writing,
     ):
         tiff = TiffFile(source, reading)
         structure = relayout.Structure.read(tiff)
         relayout.check_complete(tiff, structure)
-        entries = corrected_entries(tiff, structure.directories[0], georeference, content, more)
+        entries = corrected_entries(tiff, structure.directories[0], georeference, content)
         if structure.is_cog(tiff) or not fits(tiff, entries):
             relayout.write(tiff, reading, writing, structure, entries)
         else:
@@ -50,7 +50,7 @@ def copy_with_header(source: Path, out: Path, content: Provenance, more: Metadat
             _append(writing, tiff, entries)
 
 
-def edit_private(path: Path, content: Provenance, more: Metadata = ()) -> None:
+def edit_private(path: Path, content: Provenance, more: Metadata) -> None:
     """Correct the header of a TIFF that no one else reads yet.
 
     Raises

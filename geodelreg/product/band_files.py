@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 from xml.etree import ElementTree
 
 from affine import Affine
@@ -19,8 +18,7 @@ from geodelreg.geotiff import compare, metadata
 from geodelreg.geotiff.atomic import write_text_atomically
 from geodelreg.geotiff.corrected import write_corrected
 from geodelreg.options import WriteOptions
-from geodelreg.product.pixels import Validity, annotate, profile_of
-from geodelreg.values.raster import Grid
+from geodelreg.product.pixels import Validity, annotate, grid_of, profile_of
 from geodelreg.values.result import Correction
 
 _PLACE_PX = 1e-9  # a pixel that is further from a whole one than this is resampled
@@ -29,7 +27,7 @@ _PLACE_PX = 1e-9  # a pixel that is further from a whole one than this is resamp
 def band_targets(path: Path, folder: Path) -> dict[int, Path]:
     """Output of each band of a file, by its number there; that of a single band keeps the name."""
     with open_raster(path) as dataset:
-        names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
+        names = metadata.descriptions(dataset)
     if len(names) == 1:
         return {1: folder / path.name}
     words = [re.sub(r"\W+", "_", name or "").strip("_") for name in names]
@@ -67,6 +65,7 @@ def write_band(
 def _alone(path: Path, number: int) -> Iterator[Path]:
     """A GeoTIFF of one band; of a file that has no other the file itself."""
     import rasterio
+    from rasterio.enums import MaskFlags
 
     with open_raster(path) as dataset:
         if dataset.count == 1:
@@ -74,26 +73,16 @@ def _alone(path: Path, number: int) -> Iterator[Path]:
             return
         with TemporaryDirectory() as folder:
             alone, validity = Path(folder) / f"{path.stem}.tif", Validity.of(dataset)
-            grid = Grid(dataset.transform, dataset.shape, dataset.crs.to_wkt())
-            profile = profile_of(dataset, grid, validity)
-            profile |= {
-                "count": 1,
-                "dtype": dataset.dtypes[number - 1],
-                "photometric": "MINISBLACK",
-            }
+            profile = profile_of(dataset, grid_of(dataset), validity)
+            profile |= {"count": 1, "dtype": dataset.dtypes[number - 1]}
+            profile |= {"photometric": "MINISBLACK"}
             with rasterio.open(alone, "w", **profile) as out:
                 for window in compare.windows_of(out):
                     out.write(dataset.read(number, window=window), 1, window=window)
-                    if validity.is_mask and dataset.mask_flag_enums[0] != [_all_valid()]:
+                    if validity.is_mask and dataset.mask_flag_enums[0] != [MaskFlags.all_valid]:
                         out.write_mask(dataset.dataset_mask(window=window), window=window)
                 annotate(dataset, out, [number])
             yield alone
-
-
-def _all_valid() -> Any:
-    from rasterio.enums import MaskFlags
-
-    return MaskFlags.all_valid
 
 
 def write_vrt(

@@ -9,7 +9,15 @@ from typing import Any
 
 from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
-from geodelreg.product.report import accuracy_line, json_text, masks_line, plain, report_dict, short
+from geodelreg.product.report import (
+    accuracy_line,
+    json_text,
+    masks_line,
+    moved,
+    plain,
+    report_dict,
+    short,
+)
 from geodelreg.values.result import Alignment, BandMap, CheckOutcome, Misalignment
 
 _UNKNOWN = float("nan")
@@ -18,11 +26,6 @@ _UNSURE = (
     "The place was found, but not surely enough: allow a larger tolerance (`limit_px`), or show a "
     "larger part of the scene."
 )
-_WORDS = {
-    CheckOutcome.ALIGNED: "aligned",
-    CheckOutcome.MISALIGNED: "misaligned",
-    CheckOutcome.CANNOT_TELL: "cannot tell",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,12 +212,11 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 def _motion_line(check: Check) -> str:
     motion = header_motion(check.alignment)
-    (right, down), (width, height) = motion.shift_px, motion.scale
+    width, height = motion.scale
     return (
-        f"To fit PAN, its centre would move {short(abs(right))} px "
-        f"{'right' if right >= 0 else 'left'}, {short(abs(down))} px "
-        f"{'down' if down >= 0 else 'up'}; rotation {motion.rotation_deg:.4f}°, "
-        f"scale × {width:.6f}, × {height:.6f} (model {check.alignment.correction.model})."
+        f"To fit PAN, its centre would move {moved(motion.shift_px)}; rotation "
+        f"{motion.rotation_deg:.4f}°, scale × {width:.6f}, × {height:.6f} "
+        f"(model {check.alignment.correction.model})."
     )
 
 
@@ -239,10 +241,11 @@ def _band_lines(bands: tuple[BandCheck, ...]) -> list[str]:
     ]
     for band in bands:
         dx, dy = (_cell(value, "+.3f") for value in band.shift_px)
+        verdict = band.outcome.value.replace("_", " ")
         row = (
             f"{band.name:<{width}}  {dx:>9}  {dy:>9}  {_cell(band.sigma_px, '.3f'):>7}  "
             f"{_cell(band.misalignment.distance_px, '.3f'):>9}  "
-            f"{_cell(band.correlation, '.2f'):>5}  {_WORDS[band.outcome]}"
+            f"{_cell(band.correlation, '.2f'):>5}  {verdict}"
         )
         lines.append(row + (f": {band.reason}" if band.reason else ""))
     return lines

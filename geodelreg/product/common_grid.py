@@ -22,13 +22,8 @@ from geodelreg.geotiff import metadata
 from geodelreg.geotiff.header import Provenance
 from geodelreg.geotiff.view import corrected_view
 from geodelreg.options import WriteOptions
-from geodelreg.product.pixels import Validity
-from geodelreg.product.warp import (
-    TOLERANCE_PX,
-    edge_on_ground,
-    warp_pixels,
-    warped_onto,
-)
+from geodelreg.product.pixels import Validity, grid_of
+from geodelreg.product.warp import TOLERANCE_PX, edge_on_ground, warp_pixels, warped_onto
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, Grid
 from geodelreg.values.result import Correction
@@ -73,7 +68,7 @@ class SpectralFile:
 
         meanings = zip(dataset.indexes, dataset.colorinterp, strict=True)
         bands = [band for band, meaning in meanings if meaning is not ColorInterp.alpha]
-        names = metadata.attribute(dataset, "descriptions") or (None,) * dataset.count
+        names = metadata.descriptions(dataset)
         return cls(path, correction, placement, dataset.shape, bands, names, dataset.nodata)
 
 
@@ -99,7 +94,7 @@ class Sharpening:
 
 def target_grid(what: Sharpening, pan: Any, extent: str) -> Grid:
     """PAN's grid, or the window of it that covers what MS and PAN share."""
-    grid = Grid(pan.transform, pan.shape, pan.crs.to_wkt())
+    grid = grid_of(pan)
     if extent == "pan":
         return grid
     low, high = np.zeros(2), np.array(pan.shape[::-1], dtype=np.float64)
@@ -129,7 +124,7 @@ def check_finer(what: Sharpening) -> None:
     UsageError
     """
     with open_raster(what.reference) as pan:
-        grid = Grid(pan.transform, pan.shape, pan.crs.to_wkt())
+        grid = grid_of(pan)
     for file in what.sources:
         own = Grid(file.correction.corrected, file.shape, file.correction.crs_wkt)
         mine, others = (math.prod(gsd_px_m(one)) ** 0.5 for one in (own, grid))

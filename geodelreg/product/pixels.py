@@ -54,6 +54,11 @@ class Validity:
         return cls(nodata=math.nan) if is_float else cls()
 
 
+def grid_of(dataset: Any) -> Grid:
+    """Where an open raster lies."""
+    return Grid(dataset.transform, dataset.shape, dataset.crs.to_wkt())
+
+
 def geotiff_on(grid: Grid) -> dict[str, Any]:
     """How a GeoTIFF is made that lies on a grid."""
     height, width = grid.shape
@@ -108,7 +113,7 @@ def annotate(view: Any, dataset: Any, numbers: Sequence[int] | None = None) -> N
     if view.dtypes[0] in ("uint8", "uint16"):
         _copy_colormaps(view, dataset, numbers)
     dataset.colorinterp = of(view.colorinterp)
-    dataset.descriptions = of(metadata.attribute(view, "descriptions") or (None,) * view.count)
+    dataset.descriptions = of(metadata.descriptions(view))
     dataset.scales, dataset.offsets = of(view.scales), of(view.offsets)
     units = metadata.attribute(view, "units") or [""] * view.count
     dataset.units = [unit or "" for unit in of(units)]

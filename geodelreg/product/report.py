@@ -237,11 +237,8 @@ def found_line(alignment: Alignment) -> str:
         return "Already aligned: the header needs no correction and stays as it is."
     unit, truth = ("PAN px", "PAN") if alignment.has_pan else ("MS px", "the points")
     off = with_metres(motion.distance_px, motion.distance_m, unit)
-    (right, down), (width, height) = motion.shift_px, motion.scale
-    parts = [
-        f"{short(abs(right))} px {'right' if right >= 0 else 'left'}",
-        f"{short(abs(down))} px {'down' if down >= 0 else 'up'}",
-    ]
+    width, height = motion.scale
+    parts = [moved(motion.shift_px)]
     if alignment.correction.model in ("scale", "similarity", "affine"):
         parts.append(f"scale × {width:.6f} by × {height:.6f}")
     if alignment.correction.model in ("similarity", "affine"):
@@ -317,6 +314,15 @@ def _refused_lines(alignment: Alignment) -> list[str]:
         masks_line(alignment),
         f"Next: {alignment.verdict.remedy}",
     ]
+
+
+def moved(shift_px: tuple[float, float]) -> str:
+    """A move along columns and rows, in pixels: "3.10 px right, 0.52 px up"."""
+    right, down = shift_px
+    return (
+        f"{short(abs(right))} px {'right' if right >= 0 else 'left'}, "
+        f"{short(abs(down))} px {'down' if down >= 0 else 'up'}"
+    )
 
 
 def with_metres(px: float, m: float, unit: str = "PAN px") -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,6 @@ _COLUMNS = {
     ("easting", "northing"): False,
 }
 """Names of coordinates in a CSV file, and whether they are degrees (WGS 84) or in the MS CRS."""
-
-_Move = Callable[[FloatArray], FloatArray]
 
 
 def write_vector(

@@ -279,7 +279,7 @@ def _resampling(
     if ColorInterp.palette in view.colorinterp:
         notes.append("values of a colour table cannot be averaged; resampled by nearest neighbour")
         return "nearest", ()
-    names = metadata.attribute(view, "descriptions") or (None,) * view.count
+    names = metadata.descriptions(view)
     flags = flag_bands(source.name, names)
     if flags:
         which = " and ".join(f"{n} ({names[n - 1]})" if names[n - 1] else str(n) for n in flags)

@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 CACHE_BYTES = 64_000_000
 """GDAL's own default is 5 % of the RAM; 64 MB loses nothing when pieces are read block by block."""
@@ -19,70 +19,47 @@ TILES_BYTES = 32_000_000
 """What tiles side by side share, in strips of 40 000 pixels too."""
 
 
-class _SharedCacheLimit:
-    """GDAL has one cache for the process: the first user bounds it, the last one restores it."""
+class _CacheLimit:
+    """GDAL has one cache for the process: the first user lowers its limit, the last restores it."""
+
+    _lock = threading.Lock()
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._users = 0
-        self._before = 0
-        self._lowered = 0
-        self._usual = 0
-
-    def acquire(self) -> None:
-        from rasterio.env import get_gdal_config, set_gdal_config
-
-        with self._lock:
-            if self._users == 0:
-                self._before = int(get_gdal_config("GDAL_CACHEMAX"))
-                set_gdal_config("GDAL_CACHEMAX", min(self._before, CACHE_BYTES))
-            self._users += 1
+        self._users = self._before = 0
 
     @contextmanager
-    def lowered(self, limit: int) -> Iterator[None]:
-        """A smaller cache for a while; nothing that was read meanwhile stays in it."""
+    def at_most(self, limit: int, emptied: bool = False) -> Iterator[None]:
+        """Keep the cache at a limit, or at what the user set, if less; then restore it."""
         from rasterio.env import get_gdal_config, set_gdal_config
 
         with self._lock:
-            self._lowered += 1
-            if self._lowered == 1:
-                self._usual = int(get_gdal_config("GDAL_CACHEMAX"))
-                set_gdal_config("GDAL_CACHEMAX", min(self._usual, limit))
+            self._users += 1
+            if self._users == 1:
+                self._before = int(get_gdal_config("GDAL_CACHEMAX"))
+                set_gdal_config("GDAL_CACHEMAX", min(self._before, limit))
         try:
             yield
         finally:
             with self._lock:
-                self._lowered -= 1
-                if self._lowered == 0:
-                    set_gdal_config("GDAL_CACHEMAX", 0)
-                    set_gdal_config("GDAL_CACHEMAX", self._usual)
-
-    def release(self) -> None:
-        from rasterio.env import set_gdal_config
-
-        with self._lock:
-            self._users -= 1
-            if self._users == 0:
-                set_gdal_config("GDAL_CACHEMAX", self._before)
+                self._users -= 1
+                if self._users == 0:
+                    if emptied:
+                        set_gdal_config("GDAL_CACHEMAX", 0)
+                    set_gdal_config("GDAL_CACHEMAX", self._before)
 
 
-_cache_limit = _SharedCacheLimit()
+_open, _passing = _CacheLimit(), _CacheLimit()
 
 
-@contextmanager
-def bounded_cache() -> Iterator[None]:
+def bounded_cache() -> AbstractContextManager[None]:
     """Keep GDAL's block cache at `CACHE_BYTES` or what the user set, if less; then restore it."""
-    _cache_limit.acquire()
-    try:
-        yield
-    finally:
-        _cache_limit.release()
+    return _open.at_most(CACHE_BYTES)
 
 
 @contextmanager
 def passing_through(cache_bytes: int) -> Iterator[None]:
     """Read blocks that no one will ask for later on: they do not stay in GDAL's cache."""
-    with _cache_limit.lowered(cache_bytes):
+    with _passing.at_most(cache_bytes, emptied=True):
         yield
     trim_heap()
 

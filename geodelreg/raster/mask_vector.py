@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.masking import AUTO, VECTOR, MaskSpec
 from geodelreg.values.raster import BoolArray, FloatArray, Grid
-
-if TYPE_CHECKING:
-    from shapely.geometry.base import BaseGeometry
 
 Geometries = NDArray[np.object_]
 
@@ -226,7 +223,16 @@ def _in_pixels(path: str, geometries: Geometries, wkt: str, image: Grid) -> Geom
     They are cut off around the image first, for far away a projection has no image or a wrong one,
     and densified, for what is straight in one CRS is not in another.
     """
-    from shapely import box, clip_by_rect, get_parts, is_valid, make_valid, segmentize, transform
+    from shapely import (
+        STRtree,
+        box,
+        clip_by_rect,
+        get_parts,
+        is_valid,
+        make_valid,
+        segmentize,
+        transform,
+    )  # fmt: skip
 
     if not len(geometries):
         return geometries
@@ -243,7 +249,8 @@ def _in_pixels(path: str, geometries: Geometries, wkt: str, image: Grid) -> Geom
             f"the mask {path} cannot be put on the image: {error.cause}", error.remedy
         ) from error
     height, width = image.shape
-    return _touching(_flat(moved), box(0, 0, width, height))
+    flat = _flat(moved)
+    return np.asarray(flat[np.sort(STRtree(flat).query(box(0, 0, width, height)))])
 
 
 def _flat(geometries: Geometries) -> Geometries:
@@ -253,12 +260,6 @@ def _flat(geometries: Geometries) -> Geometries:
     while (get_type_id(geometries) >= 4).any():
         geometries = get_parts(geometries)
     return np.asarray(geometries[np.isfinite(bounds(geometries)).all(axis=1)])
-
-
-def _touching(geometries: Geometries, frame: BaseGeometry) -> Geometries:
-    from shapely import STRtree
-
-    return np.asarray(geometries[np.sort(STRtree(geometries).query(frame))])
 
 
 def _neighbourhood(image: Grid, wkt: str) -> tuple[tuple[float, float, float, float] | None, float]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,8 +24,6 @@ from geodelreg.values.raster import Band, BoolArray, Float32Array, Grid, Window
 
 if TYPE_CHECKING:
     from geodelreg.raster.masks import Masks
-
-logger = logging.getLogger(__name__)
 
 _EXACT_PIXELS = 16_000_000
 """Windows up to this size are averaged from full resolution, whatever the overviews hold."""
@@ -48,6 +45,8 @@ class RasterReader:
         One of them at least is no file; its name stands for its path.
     masks : Masks or None
         What hides pixels beyond what the files themselves say; None when nothing does.
+    decimations : tuple of float
+        Factors at which a decimated read is cheap: 1.0, then the overviews'.
     """
 
     def __init__(
@@ -70,17 +69,12 @@ class RasterReader:
         self.other_paths = tuple(file.path for file in files if file not in self._files)
         self._bands = list_bands(self._files)
         self._stored = [(self._files[band.file], band.number) for band in self._bands]
-        self._decimations = self._common_decimations()
+        self.decimations = self._common_decimations()
 
     def __enter__(self) -> RasterReader:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -118,11 +112,6 @@ class RasterReader:
     def stored(self) -> tuple[tuple[str, int], ...]:
         """File of each band, and its number there, from 1."""
         return tuple((of.path, n) for of, n in self._stored)
-
-    @property
-    def decimations(self) -> tuple[float, ...]:
-        """Factors at which a decimated read is cheap: 1.0, then the overviews'."""
-        return self._decimations
 
     @property
     def block_note(self) -> str:
@@ -184,9 +173,10 @@ class RasterReader:
         self._check_window(window, shape)
         grid = decimated_grid(self.grid, window, shape)
         wanted = [self._bands[number - 1] for number in bands]
+        by_place = attrgetter("file", "number")
         planes: dict[FileBand, tuple[Float32Array, BoolArray]] = {}
         with self._lock:
-            for index, group in groupby(sorted(set(wanted), key=_storage), lambda b: b.file):
+            for index, group in groupby(sorted(set(wanted), key=by_place), lambda b: b.file):
                 stored = list(group)
                 numbers = [band.number for band in stored]
                 data, valid = self._read_file(self._files[index], numbers, window, grid.shape)
@@ -247,7 +237,7 @@ class RasterReader:
         if window.width * window.height <= _EXACT_PIXELS:
             return None
         ratio = min(window.width / shape[1], window.height / shape[0]) * (1 + 1e-6)
-        fitting = [i for i, factor in enumerate(self._decimations[1:]) if factor <= ratio]
+        fitting = [i for i, factor in enumerate(self.decimations[1:]) if factor <= ratio]
         return fitting[-1] if fitting else None
 
     def _common_decimations(self) -> tuple[float, ...]:
@@ -255,10 +245,6 @@ class RasterReader:
         shared = min(factors, key=len)
         same = all(np.allclose(other[: len(shared)], shared) for other in factors)
         return (1.0, *(shared if same else ()))
-
-
-def _storage(band: FileBand) -> tuple[int, int]:
-    return band.file, band.number
 
 
 def open_raster(

@@ -23,6 +23,7 @@ from geodelreg.product.gcps.context import (
     Encoder,
     GcpContext,
     gcp_context,
+    gcps_at,
     ground_of,
     reading_order,
 )
@@ -133,26 +134,14 @@ def gcps_from_alignment(
         reference.crs_wkt,
         alignment.source.grid.crs_wkt,
     )
-    common = tuple(
-        Gcp(
-            str(number),
-            column,
-            row,
-            x,
-            y,
-            info=info,
-            enabled=enabled,
-            facts=facts,
-            form=alignment.solution.form,
-        )
-        for number, ((column, row), (x, y), info, enabled, facts) in enumerate(
-            zip(
-                points.source_px[order].tolist(), ground.tolist(), _infos(points, order),
-                points.kept[order].tolist(), facts_of(alignment, order), strict=True,
-            ),
-            start=1,
-        )
+    known = zip(
+        gcps_at(points.source_px[order], ground), _infos(points, order),
+        points.kept[order].tolist(), facts_of(alignment, order), strict=True,
     )  # fmt: skip
+    common = tuple(
+        replace(gcp, info=info, enabled=enabled, facts=facts, form=alignment.solution.form)
+        for gcp, info, enabled, facts in known
+    )
     return (*common, *of_bands(alignment, common)) if bands else common
 
 

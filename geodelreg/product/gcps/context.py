@@ -85,6 +85,12 @@ def gcp_context(alignment: Alignment, every: bool = False) -> GcpContext:
     )
 
 
+def gcps_at(pixels: FloatArray, ground: FloatArray) -> tuple[Gcp, ...]:
+    """Points of (N, 2) MS pixels and map coordinates, which are called by their numbers."""
+    pairs = zip(pixels.tolist(), ground.tolist(), strict=True)
+    return tuple(Gcp(str(i), *pixel, *xy) for i, (pixel, xy) in enumerate(pairs, start=1))
+
+
 def pixels_of(gcps: Sequence[Gcp]) -> FloatArray:
     """(N, 2) float64 outer-corner MS pixels."""
     return np.array([(gcp.column, gcp.row) for gcp in gcps], dtype=np.float64).reshape(-1, 2)

@@ -21,6 +21,7 @@ from geodelreg.geo.crs import map_points
 from geodelreg.product.gcps.context import (
     Decoded,
     GcpContext,
+    gcps_at,
     ground_of,
     numbers,
     pixels_of,
@@ -88,7 +89,7 @@ def decode_image_to_image(text: str, context: GcpContext | None) -> Decoded:
     reference, crs_wkt = context.reference, context.source.crs_wkt
     base = apply_affine(reference.transform, table[:, :2] - _FIRST_PIXEL)
     ground = map_points(base, reference.crs_wkt, crs_wkt)
-    return _gcps(table[:, 2:] - _FIRST_PIXEL, ground), crs_wkt
+    return gcps_at(table[:, 2:] - _FIRST_PIXEL, ground), crs_wkt
 
 
 def decode_image_to_map(text: str, context: GcpContext | None) -> Decoded:
@@ -102,7 +103,7 @@ def decode_image_to_map(text: str, context: GcpContext | None) -> Decoded:
     info = re.search(r"^;\s*projection info\s*=\s*\{([^}]*)\}", text, re.MULTILINE | re.IGNORECASE)
     table = _table(text)
     crs_wkt = _crs_of_projection(info.group(1)) if info else None
-    return _gcps(table[:, 2:] - _FIRST_PIXEL, table[:, :2]), crs_wkt
+    return gcps_at(table[:, 2:] - _FIRST_PIXEL, table[:, :2]), crs_wkt
 
 
 def _table(text: str) -> FloatArray:
@@ -115,11 +116,6 @@ def _table(text: str) -> FloatArray:
             raise GcpFormatError(f"line {number}: {len(fields)} columns instead of 4")
         rows.append(numbers(fields, number))
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
-
-
-def _gcps(pixels: FloatArray, ground: FloatArray) -> tuple[Gcp, ...]:
-    pairs = zip(pixels.tolist(), ground.tolist(), strict=True)
-    return tuple(Gcp(str(i), *pixel, *xy) for i, (pixel, xy) in enumerate(pairs, start=1))
 
 
 def projection_info(crs_wkt: str) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 from geodelreg.errors import LossyOutputError
 from geodelreg.geo.affine import apply_affine
+from geodelreg.product.gcps.context import gcps_at
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Gcp
 from geodelreg.values.raster import FloatArray, Grid
@@ -58,12 +59,7 @@ def gcps_of_map(name: str, placement: PixelMap, grid: Grid) -> tuple[Gcp, ...]:
         gap = np.concatenate([there, back - checked])  # GDAL fits a spline either way
         best = min(best, float(np.hypot(*gap.T).max()))
         if best <= AGREEMENT_PX:
-            return tuple(
-                Gcp(str(number), column, row, x, y)
-                for number, ((column, row), (x, y)) in enumerate(
-                    zip(nodes.tolist(), places.tolist(), strict=True), start=1
-                )
-            )
+            return gcps_at(nodes, places)
     raise LossyOutputError(
         f"{name}: a thin plate spline through control points is {best:.2g} px off the correction "
         f"at best, and may be {AGREEMENT_PX:g}",

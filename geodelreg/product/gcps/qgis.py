@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from geodelreg.product.gcps.context import (
     GcpContext,
     crs_wkt_of,
     exact,
+    gcps_at,
     ground_of,
     numbers,
     one_line,
@@ -78,13 +80,8 @@ def decode(text: str, context: GcpContext | None) -> Decoded:
     ]
     points = np.array(rows, dtype=np.float64).reshape(-1, 5)
     pixels = apply_affine(~context.source.transform, points[:, 2:4])
-    gcps = tuple(
-        Gcp(str(index), column, row, x, y, enabled=enable != 0)
-        for index, ((column, row), (x, y, _, _, enable)) in enumerate(
-            zip(pixels.tolist(), points.tolist(), strict=True), start=1
-        )
-    )
-    return gcps, crs_wkt
+    gcps = zip(gcps_at(pixels, points[:, :2]), (points[:, 4] != 0).tolist(), strict=True)
+    return tuple(replace(gcp, enabled=enabled) for gcp, enabled in gcps), crs_wkt
 
 
 def _row(line: str, number: int) -> list[float]:

@@ -19,22 +19,6 @@ if TYPE_CHECKING:
 
 # control characters, as TIFF tags may hold them, that XML 1.0 cannot express
 _NOT_XML = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
-_GDAL_TYPES = {
-    "uint8": "Byte",
-    "int8": "Int8",
-    "uint16": "UInt16",
-    "int16": "Int16",
-    "uint32": "UInt32",
-    "int32": "Int32",
-    "uint64": "UInt64",
-    "int64": "Int64",
-    "float16": "Float16",
-    "float32": "Float32",
-    "float64": "Float64",
-    "complex_int16": "CInt16",
-    "complex64": "CFloat32",
-    "complex128": "CFloat64",
-}
 
 
 def encode(gcps: Sequence[Gcp], context: GcpContext, path: Path) -> str:
@@ -114,8 +98,10 @@ def _add_metadata(parent: ET.Element, tags: dict[str, str]) -> None:
 def _add_band(
     root: ET.Element, dataset: DatasetReader, number: int, file_name: ET.Element
 ) -> ET.Element:
+    from rasterio.dtypes import dtype_rev, typename_fwd
+
     position = str(len(root.findall("VRTRasterBand")) + 1)
-    data_type = _GDAL_TYPES[dataset.dtypes[number - 1]]
+    data_type = typename_fwd[dtype_rev[dataset.dtypes[number - 1]]]
     band = ET.SubElement(root, "VRTRasterBand", dataType=data_type, band=position)
     _add_metadata(band, dataset.tags(number))
     _describe(band, dataset, number)
