@@ -10,11 +10,10 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
-from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from geodelreg.door.opening import open_raster, opened_vrt
 from geodelreg.geotiff.environment import gdal_session, thread_count
-from geodelreg.product.common_grid import Recipe, covered
+from geodelreg.product.common_grid import Recipe, Source, covered
 from geodelreg.product.pixels import Validity
 from geodelreg.values.raster import BoolArray
 
@@ -33,81 +32,28 @@ the fifth thread would wait (16-bit pixels, four bands, DEFLATE)."""
 
 Tile = tuple[Any, NDArray[Any], BoolArray]
 """Window, (B, H, W) sharpened pixels, and (H, W) where all inputs cover them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """A band of a raster that GDAL opens itself.
-
-    Attributes
-    ----------
-    path : Path or str
-    band : int or str
-        From 1; ``mask,1`` is the mask of band 1.
-    kind : str
-        GDAL's name of its type.
-    """
-
-    path: Path | str
-    band: int | str
-    kind: str = "Byte"
-
-    @classmethod
-    def of(cls, vrt: Path, band: int) -> Source:
-        """A band of a virtual raster, which tells its type."""
-        found = ElementTree.parse(vrt).findall("VRTRasterBand")[band - 1]
-        return cls(vrt, band, found.get("dataType", "Byte"))
-
-    def xml(self, folder: Path | None) -> str:
-        """Name it, relative to `folder` if it lies there."""
-        path = Path(self.path)
-        relative, name = path.parent == folder, str(self.path)
-        if relative:
-            name = path.name
-        elif not name.startswith("/vsi"):
-            name = str(path.absolute())
-        return (
-            f'<SourceFilename relativeToVRT="{int(relative)}">{escape(name)}</SourceFilename>'
-            f"<SourceBand>{self.band}</SourceBand>"
-        )
+Pixels = Mapping[tuple[Path, int], NDArray[Any]]
+"""By file and band."""
 
 
 def pansharpened_xml(
-    spectral: Sequence[Source],
-    pan: Source,
-    weights: Sequence[float],
-    *,
-    bit_depth: int | None = None,
-    names: Sequence[str | None] = (),
-    tags: Mapping[str, str] | None = None,
-    covers: Sequence[Source] = (),
-    folder: Path | None = None,
+    recipe: Recipe, names: Sequence[str | None] = (), tags: Mapping[str, str] | None = None
 ) -> str:
     """The VRT of the sharpened raster.
 
     Parameters
     ----------
-    spectral : sequence of Source
-        Bands to sharpen, on PAN's grid.
-    pan : Source
-    weights : sequence of float
-        Of each spectral band in the image that PAN is compared with.
-    bit_depth : int, optional
-        Bits that pixels have at most.
+    recipe : Recipe
     names : sequence of (str or None)
         Descriptions of the sharpened bands.
     tags : mapping of str to str, optional
-    covers : sequence of Source
-        Masks that say, all together, what is covered.
-    folder : Path, optional
-        Where the VRT lies.
     """
+    spectral, folder, bit_depth = recipe.spectral, recipe.folder, recipe.bit_depth
     items = "".join(
         f'<MDI key="{escape(key)}">{escape(value)}</MDI>'
         for key, value in sorted((tags or {}).items())
     )
     named = names or [None] * len(spectral)
-    depth = f"<BitDepth>{bit_depth}</BitDepth>" if bit_depth else ""
     parts = [
         '<VRTDataset subClass="VRTPansharpenedDataset">',
         f"<Metadata>{items}</Metadata>" if items else "",
@@ -117,20 +63,21 @@ def pansharpened_xml(
             f"<Description>{escape(name or '')}</Description></VRTRasterBand>"
             for number, (name, source) in enumerate(zip(named, spectral, strict=True), start=1)
         ),
-        _mask_xml(covers, folder) if covers else "",
+        _mask_xml(recipe.covers, folder) if recipe.covers else "",
         "<PansharpeningOptions><Algorithm>WeightedBrovey</Algorithm>",
         "<AlgorithmOptions><Weights>",
-        ",".join(repr(float(weight)) for weight in weights),
+        ",".join(repr(float(weight)) for weight in recipe.weights),
         "</Weights></AlgorithmOptions>",
         "<Resampling>Nearest</Resampling>",
-        depth,
-        f"<PanchroBand>{pan.xml(folder)}</PanchroBand>",
+        f"<BitDepth>{bit_depth}</BitDepth>" if bit_depth else "",
+        f"<PanchroBand>{recipe.pan.xml(folder)}</PanchroBand>",
         *(
             f'<SpectralBand dstBand="{number}">{source.xml(folder)}</SpectralBand>'
             for number, source in enumerate(spectral, start=1)
         ),
+        "</PansharpeningOptions></VRTDataset>\n",
     ]
-    return "".join([*parts, "</PansharpeningOptions></VRTDataset>\n"])
+    return "".join(parts)
 
 
 def _mask_xml(covers: Sequence[Source], folder: Path | None) -> str:
@@ -143,34 +90,23 @@ def _mask_xml(covers: Sequence[Source], folder: Path | None) -> str:
 
 
 @contextmanager
-def tiles(
-    recipe: Recipe,
-    spectral: Sequence[Source],
-    weights: Sequence[float],
-    bit_depth: int | None,
-    windows: Sequence[Any],
-) -> Iterator[Iterator[Tile]]:
+def tiles(recipe: Recipe, windows: Sequence[Any]) -> Iterator[Iterator[Tile]]:
     """Sharpen windows of the grid, side by side, and give them in order.
 
     Parameters
     ----------
     recipe : Recipe
-        Everything on one grid.
-    spectral : sequence of Source
-        Bands of its files.
-    weights : sequence of float
-    bit_depth : int or None
     windows : sequence of rasterio.windows.Window
     """
     threads = min(thread_count(), MOST_THREADS, len(windows))
-    paths = {Path(recipe.pan[0]), *recipe.files, *(path for path, _ in recipe.covers)}
+    paths = {source.path for source in (recipe.pan, *recipe.spectral, *recipe.covers)}
     idle: SimpleQueue[dict[Path, Any]] = SimpleQueue()
 
     def tile(window: Any) -> Tile:
         inputs = idle.get()
         try:
-            with gdal_session(recipe.pan[0], threads=1):
-                return window, *_tile(inputs, recipe, spectral, weights, bit_depth, window)
+            with gdal_session(recipe.pan.path, threads=1):
+                return window, *_tile(inputs, recipe, window)
         finally:
             idle.put(inputs)
 
@@ -190,57 +126,40 @@ def tiles(
 
 
 def _tile(
-    inputs: Mapping[Path, Any],
-    recipe: Recipe,
-    spectral: Sequence[Source],
-    weights: Sequence[float],
-    bit_depth: int | None,
-    window: Any,
+    inputs: Mapping[Path, Any], recipe: Recipe, window: Any
 ) -> tuple[NDArray[Any], BoolArray]:
     """A sharpened window, and where all inputs cover it."""
-    pan_path, pan_band = recipe.pan
-    asked = [
-        (Path(path), int(band))
-        for path, band in [(pan_path, pan_band), *((one.path, one.band) for one in spectral)]
-    ]
-    pixels = _read(inputs, asked, recipe.covers, window)
+    sources = (recipe.pan, *recipe.spectral)
+    pixels = _read(inputs, [*sources, *recipe.covers], window)
     with ExitStack() as stack:
         pan, *bands = [
-            _held(pixels[path, band], inputs[path].nodatavals[band - 1], stack)
-            for path, band in asked
+            replace(one, path=_held(pixels[one.place], _nodata(inputs, one), stack), band=1)
+            for one in sources
         ]
-        placed = [Source(name, 1, one.kind) for name, one in zip(bands, spectral, strict=True)]
-        text = pansharpened_xml(placed, Source(pan, 1), weights, bit_depth=bit_depth)
-        data = stack.enter_context(opened_vrt(text)).read()
-    valid = [_covered(inputs[path], pixels, path, source, window) for path, source in recipe.covers]
+        held = replace(recipe, folder=None, spectral=bands, pan=pan, covers=[])
+        data = stack.enter_context(opened_vrt(pansharpened_xml(held))).read()
+    valid = [_covered(inputs[cover.path], pixels, cover, window) for cover in recipe.covers]
     return data, np.logical_and.reduce(valid)
 
 
-def _covered(
-    dataset: Any,
-    pixels: Mapping[tuple[Path, int], NDArray[Any]],
-    path: Path,
-    source: str,
-    window: Any,
-) -> BoolArray:
+def _nodata(inputs: Mapping[Path, Any], source: Source) -> float | None:
+    path, band = source.place
+    value: float | None = inputs[path].nodatavals[band - 1]
+    return value
+
+
+def _covered(dataset: Any, pixels: Pixels, cover: Source, window: Any) -> BoolArray:
     """(H, W) where a source covers a window, from pixels that were read if these tell."""
-    band = int(source.rpartition(",")[2])
-    if source.isdigit():
-        return np.asarray(pixels[path, band] > 0)
-    if dataset.nodata is not None and (path, band) in pixels:
-        return ~Validity(nodata=dataset.nodata).missing(pixels[path, band])
-    return covered(dataset, source, window)
+    if not cover.is_mask:
+        return np.asarray(pixels[cover.place] > 0)
+    if dataset.nodata is not None and cover.place in pixels:
+        return ~Validity(nodata=dataset.nodata).missing(pixels[cover.place])
+    return covered(dataset, str(cover.band), window)
 
 
-def _read(
-    inputs: Mapping[Path, Any],
-    asked: Sequence[tuple[Path, int]],
-    covers: Sequence[tuple[Path, str]],
-    window: Any,
-) -> dict[tuple[Path, int], NDArray[Any]]:
+def _read(inputs: Mapping[Path, Any], sources: Sequence[Source], window: Any) -> Pixels:
     """Bands of a window, all of a file at once: GDAL resamples once for them."""
-    alphas = [(path, int(source)) for path, source in covers if source.isdigit()]
-    wanted = list(dict.fromkeys([*asked, *alphas]))
+    wanted = list(dict.fromkeys(one.place for one in sources if not one.is_mask))
     found = {}
     for path, dataset in inputs.items():
         bands = [band for other, band in wanted if other == path]
@@ -250,7 +169,7 @@ def _read(
     return found
 
 
-def _held(pixels: NDArray[Any], nodata: float | None, stack: ExitStack) -> str:
+def _held(pixels: NDArray[Any], nodata: float | None, stack: ExitStack) -> Path:
     """Name of a file in memory that holds a band until `stack` closes."""
     from rasterio.io import MemoryFile
 
@@ -259,4 +178,4 @@ def _held(pixels: NDArray[Any], nodata: float | None, stack: ExitStack) -> str:
     placed = Affine.scale(2.0)  # without any rasterio warns
     with memory.open(driver="GTiff", count=1, transform=placed, nodata=nodata, **profile) as file:
         file.write(pixels, 1)
-    return str(memory.name)
+    return Path(memory.name)

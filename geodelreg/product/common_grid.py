@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -24,6 +25,7 @@ from geodelreg.geotiff.view import corrected_view
 from geodelreg.options import WriteOptions
 from geodelreg.product.pixels import Validity, grid_of
 from geodelreg.product.warp import TOLERANCE_PX, edge_on_ground, warp_pixels, warped_onto
+from geodelreg.sharpen_options import PansharpenOptions
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, Grid
 from geodelreg.values.result import Correction
@@ -179,52 +181,106 @@ def covered(dataset: Any, source: str, window: Any = None) -> BoolArray:
 
 
 @dataclass(frozen=True, slots=True)
+class Source:
+    """A band of a raster that GDAL opens itself.
+
+    Attributes
+    ----------
+    path : Path
+    band : int or str
+        From 1; ``mask,1`` is the mask of band 1.
+    kind : str
+        GDAL's name of its type.
+    """
+
+    path: Path
+    band: int | str
+    kind: str = "Byte"
+
+    @classmethod
+    def of(cls, vrt: Path, band: int) -> Source:
+        """A band of a virtual raster, which tells its type."""
+        found = ElementTree.parse(vrt).findall("VRTRasterBand")[band - 1]
+        return cls(vrt, band, found.get("dataType", "Byte"))
+
+    @property
+    def is_mask(self) -> bool:
+        """Whether it is the mask of a band."""
+        return str(self.band).startswith("mask")
+
+    @property
+    def place(self) -> tuple[Path, int]:
+        """File, and number of the band, also of a mask."""
+        return self.path, int(str(self.band).rpartition(",")[2])
+
+    def xml(self, folder: Path | None) -> str:
+        """Name it, relative to `folder` if it lies there."""
+        relative, name = self.path.parent == folder, str(self.path)
+        if relative:
+            name = self.path.name
+        elif not name.startswith("/vsi"):
+            name = str(self.path.absolute())
+        return (
+            f'<SourceFilename relativeToVRT="{int(relative)}">{escape(name)}</SourceFilename>'
+            f"<SourceBand>{self.band}</SourceBand>"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Recipe:
     """Everything on one grid, as files that GDAL reads when pixels are asked for.
 
     Attributes
     ----------
-    folder : Path
+    folder : Path or None
         Of the virtual rasters.
-    files : list of Path
-        Virtual raster of each MS file.
-    pan : (Path, int)
-        PAN and its band.
-    covers : list of (Path, str)
-        What says, all together, what is covered: files and their `cover_of`.
+    spectral : list of Source
+        Bands to sharpen.
+    pan : Source
+    covers : list of Source
+        What says, all together, what is covered.
+    weights : sequence of float
+        Of each spectral band in the image that PAN is compared with.
+    bit_depth : int or None
+        Bits that pixels have at most.
     """
 
-    folder: Path
-    files: list[Path]
-    pan: tuple[Path, int]
-    covers: list[tuple[Path, str]]
+    folder: Path | None
+    spectral: list[Source]
+    pan: Source
+    covers: list[Source]
+    weights: Sequence[float]
+    bit_depth: int | None
 
 
-def recipe_of(what: Sharpening, out: Path, grid: Grid, resampling: str) -> Recipe:
+def recipe_of(
+    what: Sharpening, out: Path, grid: Grid, weights: Sequence[float], options: PansharpenOptions
+) -> Recipe:
     """Write virtual rasters beside `out` that lay everything onto the grid."""
     import rasterio
     import rasterio.shutil
 
     files = [out.with_name(f"{out.name}.ms{n}.vrt") for n in range(1, len(what.sources) + 1)]
-    covers: list[tuple[Path, str]] = []
-    with on_grid(what, grid, resampling, out.parent) as warped:
+    covers: list[Source] = []
+    with on_grid(what, grid, options.resampling, out.parent) as warped:
         for number, (path, lazy) in enumerate(zip(files, warped, strict=True)):
             rasterio.shutil.copy(lazy, path, driver="VRT")
             if what.sources[number].placement is None:
                 _name_source(path, what.sources[number].path)
             used = [band for file, band in what.bands if file == number]
             each = used if lazy.nodata is not None else used[:1]
-            covers += [(path, cover_of(lazy, band)) for band in each]
-    pan = (what.reference, what.pan_band)
+            covers += [Source(path, cover_of(lazy, band)) for band in each]
+    pan = Source(what.reference, what.pan_band)
     with open_raster(what.reference) as dataset:
         flags = {flag.name for flag in dataset.mask_flag_enums[what.pan_band - 1]}
         if "all_valid" not in flags or grid.shape != dataset.shape:
-            pan = (out.with_name(f"{out.name}.pan.vrt"), what.pan_band)
+            pan = Source(out.with_name(f"{out.name}.pan.vrt"), what.pan_band)
             with warped_onto(dataset, grid, Validity.of(dataset), "nearest") as lazy:
-                rasterio.shutil.copy(lazy, pan[0], driver="VRT")
-                covers.append((pan[0], cover_of(lazy, what.pan_band)))
-            _name_source(pan[0], what.reference)
-    return Recipe(out.parent, files, pan, covers)
+                rasterio.shutil.copy(lazy, pan.path, driver="VRT")
+                covers.append(Source(pan.path, cover_of(lazy, what.pan_band)))
+            _name_source(pan.path, what.reference)
+    spectral = [Source.of(files[file], band) for file, band in what.bands]
+    return Recipe(out.parent, spectral, pan, covers, weights, options.bit_depth)
 
 
 def _name_source(vrt: Path, source: Path) -> None:

@@ -26,9 +26,8 @@ from geodelreg.geotiff import sidecars
 from geodelreg.geotiff.atomic import staged
 from geodelreg.geotiff.environment import gdal_session
 from geodelreg.geotiff.rewrite import gdal_write, output_driver, user_creation
-from geodelreg.product.brovey import Source, pansharpened_xml, tiles
+from geodelreg.product.brovey import pansharpened_xml, tiles
 from geodelreg.product.common_grid import (
-    Recipe,
     Sharpening,
     SpectralFile,
     cover_of,
@@ -193,19 +192,8 @@ def _write_vrt(
             "`nodata` and `creation_options` need pixels to be written, and a VRT has none",
             "Name a GeoTIFF (.tif), or drop them: a VRT tells by its mask what is not covered.",
         )
-    recipe = recipe_of(what, out, grid, options.resampling)
-    names = _descriptions(what)
-    text = pansharpened_xml(
-        _spectral(what, recipe),
-        Source(*recipe.pan),
-        weights,
-        bit_depth=options.bit_depth,
-        names=names,
-        tags=tags,
-        covers=[Source(*cover) for cover in recipe.covers],
-        folder=recipe.folder,
-    )
-    out.write_text(text, encoding="utf-8")
+    recipe = recipe_of(what, out, grid, weights, options)
+    out.write_text(pansharpened_xml(recipe, _descriptions(what), tags), encoding="utf-8")
     with open_raster(out) as dataset:  # GDAL takes it
         dataset.read(1, window=((0, 1), (0, 1)))
     folder = Path(os.path.realpath(target)).parent
@@ -248,12 +236,12 @@ def _write_tiff(
     import rasterio
     from rasterio.windows import Window
 
-    recipe = recipe_of(what, lazy, grid, options.resampling)
-    spectral = _spectral(what, recipe)
-    with open_raster(spectral[0].path) as dataset:
-        dtype = np.dtype(dataset.dtypes[int(spectral[0].band) - 1])
+    recipe = recipe_of(what, lazy, grid, weights, options)
+    path, band = recipe.spectral[0].place
+    with open_raster(path) as dataset:
+        dtype = np.dtype(dataset.dtypes[band - 1])
     nodata = _nodata(what, dtype, options)
-    profile = _profile(len(spectral), dtype, grid, nodata) | {
+    profile = _profile(len(recipe.spectral), dtype, grid, nodata) | {
         key.lower(): value for key, value in user_creation(options).items()
     }
     height, width = grid.shape
@@ -265,7 +253,7 @@ def _write_tiff(
     with (
         gdal_session(what.reference, threads=1),  # the tiles have threads of their own
         rasterio.open(draft, "w", **profile) as dataset,
-        tiles(recipe, spectral, weights, options.bit_depth, windows) as sharpened,
+        tiles(recipe, windows) as sharpened,
     ):
         dataset.descriptions = _descriptions(what)
         dataset.update_tags(**tags)
@@ -276,11 +264,6 @@ def _write_tiff(
                 dataset.write_mask(valid, window=window)
             dataset.write(data, window=window)
             progress(number / len(windows), "sharpening")
-
-
-def _spectral(what: Sharpening, recipe: Recipe) -> list[Source]:
-    """The bands to sharpen, on the grid."""
-    return [Source.of(recipe.files[file], band) for file, band in what.bands]
 
 
 def _nodata(what: Sharpening, kind: np.dtype[Any], options: PansharpenOptions) -> float | None:
