@@ -22,13 +22,7 @@ if TYPE_CHECKING:
     from geodelreg.sharpen import pansharpen
     from geodelreg.sharpen_options import PansharpenOptions
     from geodelreg.values.raster import Grid
-    from geodelreg.writing import (
-        export_gcps,
-        revert,
-        write,
-        write_displacement,
-        write_in_place,
-    )
+    from geodelreg.writing import export_gcps, revert, write, write_displacement, write_in_place
 
 
 __all__ = [

@@ -11,11 +11,7 @@ from pathlib import Path
 from typing import Unpack
 
 from geodelreg.alignment import Alignment
-from geodelreg.errors import (
-    AlignmentRefusedError,
-    NoDataError,
-    UsageError,
-)
+from geodelreg.errors import AlignmentRefusedError, NoDataError, UsageError
 from geodelreg.geotiff.private import unsettled
 from geodelreg.judge.check import (
     is_affine_enough,
@@ -122,9 +118,7 @@ def _asked(
     options = replace(options or AlignOptions(), **knobs)
     (names, arrays), (pan_names, pan_arrays) = split_masks(mask), split_masks(pan_mask)
     options = replace(
-        options,
-        masks=(*options.masks, *names),
-        pan_masks=(*options.pan_masks, *pan_names),
+        options, masks=(*options.masks, *names), pan_masks=(*options.pan_masks, *pan_names)
     )
     return options, arrays, pan_arrays
 

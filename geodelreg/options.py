@@ -64,9 +64,7 @@ class AlignOptions:
         "OUT is then a folder with one file per band, a .vrt, or resampled (`warp`).",
     )
     band_model: str = knob(
-        "shift",
-        "How a band may lie to the common map, with `per_band`.",
-        ("shift", "affine"),
+        "shift", "How a band may lie to the common map, with `per_band`.", ("shift", "affine")
     )
     agreeing_bands: tuple[int, ...] = knob(
         (),

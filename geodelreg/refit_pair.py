@@ -189,11 +189,7 @@ def _check_enough(given: GivenPoints, points: Observations, model: str) -> None:
 
 
 def _fit(
-    pair: Pair,
-    given: GivenPoints,
-    points: Observations,
-    used: BoolArray,
-    form: FitForm | None,
+    pair: Pair, given: GivenPoints, points: Observations, used: BoolArray, form: FitForm | None
 ) -> _Fit:
     """The model asked for, or that of the points' own fit; what it stands on of the points used.
 

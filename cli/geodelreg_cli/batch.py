@@ -210,10 +210,7 @@ def _batch(manifest: Path | None, given: dict[str, Any]) -> Batch:
         out_root=given["out_root"],
         resume=given["resume"],
         retry=[outcome for name in given["retry"] for outcome in RETRY[name]],
-        tables=(
-            *(given["table"] or [ledger.with_suffix(".results.csv")]),
-            *given["footprints"],
-        ),
+        tables=(*(given["table"] or [ledger.with_suffix(".results.csv")]), *given["footprints"]),
         report_dir=given["report_dir"],
         config=dict(given["config"]),
     )

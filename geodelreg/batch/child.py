@@ -22,21 +22,8 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
-from geodelreg.batch.job import (
-    ALREADY_ALIGNED,
-    CHECK,
-    FAILED,
-    IN_PLACE,
-    REFUSED,
-    PairResult,
-    Task,
-)
-from geodelreg.errors import (
-    AlignmentRefusedError,
-    FileLockedError,
-    GeodelregError,
-    PairMemoryError,
-)
+from geodelreg.batch.job import ALREADY_ALIGNED, CHECK, FAILED, IN_PLACE, REFUSED, PairResult, Task
+from geodelreg.errors import AlignmentRefusedError, FileLockedError, GeodelregError, PairMemoryError
 
 if TYPE_CHECKING:
     from geodelreg.product.check import Check

@@ -266,12 +266,7 @@ class Batch:
         )
 
     def _result(
-        self,
-        number: int,
-        pair: Pair,
-        future: Future[str],
-        workers: Workers,
-        losses: Counter[int],
+        self, number: int, pair: Pair, future: Future[str], workers: Workers, losses: Counter[int]
     ) -> PairResult | None:
         """What a future says; None when its worker was lost and the pair has to run elsewhere."""
         error = None if future.cancelled() else future.exception()

@@ -7,15 +7,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
 from geodelreg.door.files import check_regular
-from geodelreg.door.names import (
-    ALL,
-    NETWORK,
-    check_name,
-    in_zip,
-    is_local,
-    needed_access,
-    refuse,
-)
+from geodelreg.door.names import ALL, NETWORK, check_name, in_zip, is_local, needed_access, refuse
 from geodelreg.errors import RasterUnreadableError
 
 if TYPE_CHECKING:

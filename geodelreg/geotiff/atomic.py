@@ -19,10 +19,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 
-from geodelreg.errors import (
-    FileLockedError,
-    OutputUnwritableError,
-)
+from geodelreg.errors import FileLockedError, OutputUnwritableError
 from geodelreg.geotiff import journal, undo
 from geodelreg.geotiff.durable import fsync_folder, fsync_path, inherit, unwritable
 from geodelreg.geotiff.private import PrivateFolder, private_path

@@ -18,11 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from geodelreg.door.opening import own_name
-from geodelreg.errors import (
-    OutputUnwritableError,
-    RasterNotFoundError,
-    UnsafeInPlaceError,
-)
+from geodelreg.errors import OutputUnwritableError, RasterNotFoundError, UnsafeInPlaceError
 from geodelreg.geotiff import compare, metadata, relayout, sidecars, undo
 from geodelreg.geotiff.atomic import exclusive, together
 from geodelreg.geotiff.corrected import check_source

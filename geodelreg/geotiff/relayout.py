@@ -154,11 +154,7 @@ def write(
 
 
 def _front(
-    tiff: TiffFile,
-    layout: Layout,
-    structure: Structure,
-    main_entries: Sequence[Entry],
-    shift: int,
+    tiff: TiffFile, layout: Layout, structure: Structure, main_entries: Sequence[Entry], shift: int
 ) -> bytes:
     """Header and directories, for blocks that move by `shift` bytes."""
     first = layout.header_bytes + len(structure.ghost)

@@ -10,13 +10,7 @@ from geodelreg.geotiff import relayout
 from geodelreg.geotiff.copying import copy_range, open_source, unchanged
 from geodelreg.geotiff.durable import write_fully
 from geodelreg.geotiff.header import Georeference, Metadata, Provenance, corrected_entries
-from geodelreg.tiff import (
-    CLASSIC_LIMIT,
-    Entry,
-    TiffFile,
-    directory_length,
-    encode_directory,
-)
+from geodelreg.tiff import CLASSIC_LIMIT, Entry, TiffFile, directory_length, encode_directory
 
 
 def copy_with_header(source: Path, out: Path, content: Provenance) -> None:

@@ -56,10 +56,7 @@ def write_grid(alignment: Alignment, path: Path, overwrite: bool = False) -> Non
     data = displacement(alignment, at, metres).reshape(height, width, len(BANDS))
     profile = geotiff_on(Grid(source.transform @ step, (height, width), source.crs_wkt))
     profile |= {"count": len(BANDS), "dtype": "float64", "compress": "DEFLATE", "predictor": 3}
-    with (
-        staged(path, overwrite=overwrite) as out,
-        rasterio.open(out, "w", **profile) as dataset,
-    ):
+    with staged(path, overwrite=overwrite) as out, rasterio.open(out, "w", **profile) as dataset:
         dataset.write(np.moveaxis(data, -1, 0))
         dataset.descriptions = BANDS
         dataset.units = ("metre", "metre", "pixel", "pixel", "pixel")

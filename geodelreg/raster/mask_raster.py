@@ -10,12 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geodelreg.errors import (
-    CrsTransformError,
-    GeodelregError,
-    MaskError,
-    MissingCrsError,
-)
+from geodelreg.errors import CrsTransformError, GeodelregError, MaskError, MissingCrsError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import crs_operation, map_points
 from geodelreg.geo.grid import decimated_grid
@@ -76,11 +71,7 @@ class RasterMask:
     """
 
     def __init__(
-        self,
-        spec: MaskSpec,
-        image: Grid,
-        opened: Opened,
-        band: int | None = None,
+        self, spec: MaskSpec, image: Grid, opened: Opened, band: int | None = None
     ) -> None:
         self.path, self._dataset = spec.path, opened.dataset
         self._hide = spec.hide

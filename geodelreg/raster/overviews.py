@@ -113,10 +113,7 @@ def _patch_window(
 
 
 def _prediction_errors(
-    read_patch: ReadPatch,
-    window: Window,
-    candidates: list[Placement],
-    full_shape: tuple[int, int],
+    read_patch: ReadPatch, window: Window, candidates: list[Placement], full_shape: tuple[int, int]
 ) -> list[float]:
     """Sum of squared prediction errors of one patch for each candidate."""
     scale = candidates[0].scale

@@ -336,10 +336,7 @@ def _validity(
 
 
 def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
-    return (
-        (window.row, window.row + window.height),
-        (window.column, window.column + window.width),
-    )
+    return ((window.row, window.row + window.height), (window.column, window.column + window.width))
 
 
 def _pieces(

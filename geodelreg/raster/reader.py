@@ -190,11 +190,7 @@ class RasterReader:
         return passing_through(TILES_BYTES)
 
     def _open_masks(
-        self,
-        files: list[RasterFile],
-        names: Sequence[AnyMask] | None,
-        stack: ExitStack,
-        allow: str,
+        self, files: list[RasterFile], names: Sequence[AnyMask] | None, stack: ExitStack, allow: str
     ) -> Masks | None:
         """The masks named, and the quality bands of the files."""
         bands = [

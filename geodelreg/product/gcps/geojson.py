@@ -12,12 +12,7 @@ import numpy as np
 
 from geodelreg.errors import GcpFormatError
 from geodelreg.geo.crs import map_points
-from geodelreg.product.gcps.context import (
-    Decoded,
-    GcpContext,
-    crs_name,
-    ground_of,
-)
+from geodelreg.product.gcps.context import Decoded, GcpContext, crs_name, ground_of
 from geodelreg.product.gcps.features import fields_of_gcp, gcps_of
 from geodelreg.values.points import Gcp
 
