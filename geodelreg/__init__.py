@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from geodelreg.alignment import Alignment
     from geodelreg.api import align, check, refit
     from geodelreg.applying import apply
+    from geodelreg.geotiff.inplace import revert
     from geodelreg.options import AlignOptions, WriteOptions
     from geodelreg.product.check import Check
     from geodelreg.report.candidate import write_candidate
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from geodelreg.sharpen import pansharpen
     from geodelreg.sharpen_options import PansharpenOptions
     from geodelreg.values.raster import Grid
-    from geodelreg.writing import export_gcps, revert, write, write_displacement, write_in_place
+    from geodelreg.writing import export_gcps, write, write_displacement, write_in_place
 
 
 __all__ = [
@@ -61,7 +62,7 @@ _HOMES = {
     "export_gcps": "geodelreg.writing",
     "pansharpen": "geodelreg.sharpen",
     "refit": "geodelreg.api",
-    "revert": "geodelreg.writing",
+    "revert": "geodelreg.geotiff.inplace",
     "write": "geodelreg.writing",
     "write_candidate": "geodelreg.report.candidate",
     "write_displacement": "geodelreg.writing",

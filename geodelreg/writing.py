@@ -166,19 +166,6 @@ def placement_of(alignment: Alignment, correction: Correction) -> PixelMap | Non
     return to_shared.then(shared).then(AffineMap(~to_shared.affine))
 
 
-def revert(*paths: AnyPath) -> None:
-    """Take back what `write_in_place` did: the files are bit by bit what they were.
-
-    Raises
-    ------
-    UnsafeInPlaceError, OutputUnwritableError, FileLockedError, RasterNotFoundError
-        For one of the files; none is changed.
-    """
-    from geodelreg.geotiff.inplace import revert as revert_files
-
-    revert_files(*map(Path, paths))
-
-
 @as_allowed
 def export_gcps(
     alignment: Alignment,

@@ -85,12 +85,12 @@ def edit_in_place(
     return notes
 
 
-def revert(*paths: Path) -> None:
-    """Take back all edits in place: each file is bit by bit what it was before the first.
+def revert(*paths: str | os.PathLike[str]) -> None:
+    """Take back what `write_in_place` did: each file is bit by bit what it was before the first.
 
     Parameters
     ----------
-    *paths : Path
+    *paths : path
         Nothing is done unless it can be done to all of them.
 
     Raises
@@ -101,7 +101,7 @@ def revert(*paths: Path) -> None:
     """
     with ExitStack() as stack:
         waiting = []
-        for path in dict.fromkeys(paths):
+        for path in dict.fromkeys(map(Path, paths)):
             raster = Path(os.path.realpath(path))
             check_editable(path)
             folder = stack.enter_context(exclusive(raster))

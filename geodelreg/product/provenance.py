@@ -47,11 +47,10 @@ def fingerprint(path: str | Path) -> str:
         last = size - _END_BYTES
         room = last - _END_BYTES - _BLOCK_BYTES
         starts = [_END_BYTES + room * block // (_BLOCKS - 1) for block in range(_BLOCKS)]
-        for start, length in [(0, _END_BYTES), *((s, _BLOCK_BYTES) for s in starts)]:
+        blocks = ((start, _BLOCK_BYTES) for start in starts)
+        for start, length in [(0, _END_BYTES), *blocks, (last, _END_BYTES)]:
             stream.seek(start)
             digest.update(stream.read(length))
-        stream.seek(last)
-        digest.update(stream.read(_END_BYTES))
     return f"sha256-sampled:{digest.hexdigest()}"
 
 

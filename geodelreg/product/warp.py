@@ -207,19 +207,17 @@ def _target_grid(
     placement: PixelMap | None,
 ) -> Grid:
     if options.warp_grid == "pan":
-        grid = reference
-    else:
-        with open_raster(source) as dataset:
-            shape = dataset.shape
-        try:
-            grid = north_up_grid(correction, shape, placement)
-        except (OverflowError, ValueError) as error:
-            raise UnsupportedGeoreferenceError(
-                f"the corrected geotransform of {source} is too large to be covered by pixels: "
-                f"{tuple(correction.corrected)[:6]}",
-                "Check the geotransform with gdalinfo, or use `warp_grid='pan'`.",
-            ) from error
-    return grid
+        return reference
+    with open_raster(source) as dataset:
+        shape = dataset.shape
+    try:
+        return north_up_grid(correction, shape, placement)
+    except (OverflowError, ValueError) as error:
+        raise UnsupportedGeoreferenceError(
+            f"the corrected geotransform of {source} is too large to be covered by pixels: "
+            f"{tuple(correction.corrected)[:6]}",
+            "Check the geotransform with gdalinfo, or use `warp_grid='pan'`.",
+        ) from error
 
 
 def warp_pixels(

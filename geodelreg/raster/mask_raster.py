@@ -75,9 +75,7 @@ class RasterMask:
     ) -> None:
         self.path, self._dataset = spec.path, opened.dataset
         self._hide = spec.hide
-        self._lock = (
-            threading.Lock()
-        )  # the image is read by several threads, the mask has one handle
+        self._lock = threading.Lock()  # several threads read the image, and the mask has one handle
         self.band = band or _only_band(spec.path, self._dataset)
         self.kind = self._kind_of(spec.kind)
         self._nodata = self._dataset.nodatavals[self.band - 1]
@@ -106,9 +104,8 @@ class RasterMask:
         """
         out = np.zeros(grid.shape, dtype=np.bool_)
         for window in _blocks(grid, self._grid):
-            rows = slice(window.row, window.row + window.height)
-            columns = slice(window.column, window.column + window.width)
-            out[rows, columns] = self._hidden_block(decimated_grid(grid, window))
+            rows, columns = window.edges
+            out[slice(*rows), slice(*columns)] = self._hidden_block(decimated_grid(grid, window))
         return out
 
     def _hidden_block(self, grid: Grid) -> BoolArray:
@@ -130,13 +127,9 @@ class RasterMask:
     def _stored(self, window: Window) -> NDArray[Any]:
         from rasterio.errors import RasterioError
 
-        area = (
-            (window.row, window.row + window.height),
-            (window.column, window.column + window.width),
-        )
         try:
             with self._lock, gdal_calls():
-                return np.asarray(self._dataset.read(self.band, window=area))
+                return np.asarray(self._dataset.read(self.band, window=window.edges))
         except (RasterioError, OSError, MemoryError, ValueError) as error:
             reason = " ".join(str(error.__cause__ or error).split())
             raise MaskError(

@@ -291,7 +291,7 @@ class RasterFile:
     ) -> list[tuple[slice | int, BoolArray]]:
         """Masks of the file, each with the planes that it applies to."""
         masks: list[tuple[slice | int, BoolArray]] = [
-            (slice(None), level.read(number, window=_slices(window)) != 0) for number in self._alpha
+            (slice(None), level.read(number, window=window.edges) != 0) for number in self._alpha
         ]
         for plane, number in enumerate(numbers):
             if number in self._masked_bands:
@@ -300,7 +300,7 @@ class RasterFile:
 
     def _own_mask(self, number: int, window: Window, level: DatasetReader) -> NDArray[np.uint8]:
         if level.shape == self.dataset.shape:
-            return np.asarray(level.read_masks(number, window=_slices(window)))
+            return np.asarray(level.read_masks(number, window=window.edges))
         # an overview without a mask of its own claims to be valid everywhere: ask the full raster
         down, across = self.dataset.height / level.height, self.dataset.width / level.width
         area = (
@@ -314,8 +314,8 @@ class RasterFile:
 def _read(level: DatasetReader, numbers: Sequence[int], window: Window) -> NDArray[Any]:
     """Pixels of bands, in a type that holds those of each."""
     if len({level.dtypes[number - 1] for number in numbers}) == 1:
-        return np.asarray(level.read(list(numbers), window=_slices(window)))
-    return np.stack([level.read(number, window=_slices(window)) for number in numbers])
+        return np.asarray(level.read(list(numbers), window=window.edges))
+    return np.stack([level.read(number, window=window.edges) for number in numbers])
 
 
 def _validity(
@@ -333,10 +333,6 @@ def _validity(
         if mask is not None:
             valid[plane] &= mask
     return None if valid.all() else valid
-
-
-def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
-    return ((window.row, window.row + window.height), (window.column, window.column + window.width))
 
 
 def _pieces(

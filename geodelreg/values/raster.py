@@ -36,6 +36,11 @@ class Window(NamedTuple):
     width: int
     height: int
 
+    @property
+    def edges(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and past the last row, and column: a window of rasterio's."""
+        return (self.row, self.row + self.height), (self.column, self.column + self.width)
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
