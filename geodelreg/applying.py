@@ -102,7 +102,7 @@ def _apply_to_raster(
     if not force:
         stored.check_fits(str(file), grid)
         stored.check_uncorrected(file)
-    correction, placement = stored.of_raster(grid)
+    correction, placement = stored.placed(stored.map, grid)
     apart = stored.of_bands(str(file), grid, count)
     bent = placement is not None or any(held is not None for _, held in apart.values())
     if bent and not options.warp:

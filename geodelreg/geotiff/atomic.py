@@ -284,16 +284,16 @@ class Run:
             except OSError as error:
                 raise unwritable(folder.target, error) from error
         elif touched:
-            journal.publish({one: self._in_group(one) for one in self._plans})
+            targets = [one.target for one in self._plans]
+            for one, plan in self._plans.items():
+                group = [os.path.relpath(target, one.target.parent) for target in targets]
+                self._plans[one] = replace(plan, group=group)
+            journal.publish(self._plans)
 
     def close(self) -> None:
         """Give up all locks; what was not published is gone."""
         for folder in self._locked.values():
             folder.release()
-
-    def _in_group(self, folder: PrivateFolder) -> journal.Plan:
-        group = [os.path.relpath(one.target, folder.target.parent) for one in self._plans]
-        return replace(self._plans[folder], group=group)
 
     def _plan(
         self, folder: PrivateFolder, files: dict[str, bool], removed: list[str], edits: int

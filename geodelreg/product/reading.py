@@ -36,6 +36,8 @@ from geodelreg.values.result import (
 
 _READ = ("1.", "2.")
 """Versions of the schema: 1 has fields more, which mean nothing to us, and lacks some."""
+_NAME_ONE = "Name the JSON file of `write_report`."
+_AGAIN = "Make it again: geodelreg align MS PAN --dry-run --report FILE.json."
 MOST_BYTES = 256_000_000
 """Of a report: one of 100 000 tie points has 60 MB."""
 
@@ -60,23 +62,17 @@ def read_report(path: Path) -> Alignment:
     """
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise ReportError(
-                f"{path} is too large for a report", "Name the JSON file of `write_report`."
-            )
+            raise ReportError(f"{path} is too large for a report", _NAME_ONE)
         report = json.loads(path.read_bytes())
     except OSError as error:
-        raise ReportError(
-            f"{path} cannot be read ({error.strerror})", "Name the JSON file of `write_report`."
-        ) from error
+        raise ReportError(f"{path} cannot be read ({error.strerror})", _NAME_ONE) from error
     except (ValueError, RecursionError) as error:
-        raise ReportError(
-            f"{path} is no JSON ({error})", "Name the JSON file of `write_report`."
-        ) from error
+        raise ReportError(f"{path} is no JSON ({error})", _NAME_ONE) from error
     version = report.get("schema_version") if isinstance(report, dict) else None
     if not str(version).startswith(_READ):
         raise ReportError(
             f"{path} is no report of version 1 or 2" + (f" but of {version}" if version else ""),
-            "Make it again: geodelreg align MS PAN --dry-run --report FILE.json.",
+            _AGAIN,
         )
     try:
         return _alignment(report)
@@ -84,8 +80,7 @@ def read_report(path: Path) -> Alignment:
         raise ReportError(f"{path}: {error.cause}", error.remedy) from error
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise ReportError(
-            f"{path} is a report in which something is missing or wrong ({error!r})",
-            "Make it again: geodelreg align MS PAN --dry-run --report FILE.json.",
+            f"{path} is a report in which something is missing or wrong ({error!r})", _AGAIN
         ) from error
 
 

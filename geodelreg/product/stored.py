@@ -69,18 +69,8 @@ class StoredCorrection:
         there = apply_affine(self.source.transform, moved)
         return map_points(there, self.source.crs_wkt, crs_wkt)
 
-    def of_raster(self, grid: Grid) -> _Placed:
-        """Of a raster that shares the header error: its header, and its map where that holds none.
-
-        Parameters
-        ----------
-        grid : Grid
-            With its own header, in any CRS.
-        """
-        return self._placed(self.map, grid)
-
     def of_bands(self, name: str, grid: Grid, count: int) -> dict[int, _Placed]:
-        """The same of each band of a raster that lies elsewhere than the others.
+        """`placed` of each band of a raster that lies elsewhere than the others.
 
         Parameters
         ----------
@@ -101,9 +91,18 @@ class StoredCorrection:
                 f"{max(self.bands)} bands lies",
                 "Apply it to rasters with the bands of MS; for others align without `per_band`.",
             )
-        return {number: self._placed(placed, grid) for number, placed in self.bands.items()}
+        return {number: self.placed(placed, grid) for number, placed in self.bands.items()}
 
-    def _placed(self, moved: PixelMap, grid: Grid) -> _Placed:
+    def placed(self, moved: PixelMap, grid: Grid) -> _Placed:
+        """Of a raster that shares the header error: its header, and its map where that holds none.
+
+        Parameters
+        ----------
+        moved : PixelMap
+            `map`, or that of a band.
+        grid : Grid
+            With its own header, in any CRS.
+        """
         there = header_map(grid, self.source)
         placement = there.then(moved).then(Inverse(there))
         affine = moved.as_affine()

@@ -248,7 +248,12 @@ def read_gcps(
         gcps, crs_wkt = chosen.decode(content, context)
         if not every:
             gcps = tuple(gcp for gcp in gcps if gcp.enabled and not band_of(gcp))
-            _check_pixels(gcps)
+            nowhere = [gcp.id for gcp in gcps if not math.isfinite(gcp.column + gcp.row)]
+            if nowhere:
+                raise GcpFormatError(
+                    f"point {nowhere[0]} lacks the pixel of MS, row and col",
+                    "Fill it in, take the point out, or let geodelreg refit look for it (`snap`).",
+                )
         return gcps, crs_wkt
     except GcpFormatError as error:
         remedy = error.remedy or f"Correct the file, or name its format; {name} was read."
@@ -273,15 +278,6 @@ def in_crs_of(source: Grid, gcps: Sequence[Gcp], crs_wkt: str | None) -> tuple[G
         return tuple(gcps)
     moved = map_points(ground_of(gcps), crs_wkt, source.crs_wkt).tolist()
     return tuple(replace(gcp, x=x, y=y) for gcp, (x, y) in zip(gcps, moved, strict=True))
-
-
-def _check_pixels(gcps: Sequence[Gcp]) -> None:
-    nowhere = [gcp.id for gcp in gcps if not math.isfinite(gcp.column + gcp.row)]
-    if nowhere:
-        raise GcpFormatError(
-            f"point {nowhere[0]} lacks the pixel of MS, row and col",
-            "Fill it in, take the point out, or let geodelreg refit look for it (`snap`).",
-        )
 
 
 def _content(source: Path, is_text: bool) -> str | Path:

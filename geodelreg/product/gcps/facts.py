@@ -41,19 +41,19 @@ Facts = tuple[tuple[str, float | None], ...]
 
 def facts_of(alignment: Alignment, order: IntArray) -> list[Facts]:
     """Facts of some tie points; None where one is not known."""
-    points = alignment.tie_points
-    sigma = _covariance_facts(
-        map_covariance(
-            points.reference_px[order], points.covariance_px2[order],
-            alignment.source.grid, alignment.reference.grid,
-        )
-    )  # fmt: skip
+    points, source = alignment.tie_points, alignment.source.grid
+    covariance = map_covariance(
+        points.reference_px[order], points.covariance_px2[order], source, alignment.reference.grid
+    )
+    sigma = np.sqrt(covariance[:, (0, 1), (0, 1)])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        together = covariance[:, 0, 1] / (sigma[:, 0] * sigma[:, 1])
     weight = np.full(len(points), np.nan) if points.weight is None else points.weight
     rows = np.column_stack(
         [
             points.status[order], np.zeros(len(order)), points.residual_px[order],
-            points.sigma_px[order], points.score[order], sigma, weight[order],
-            apply_affine(alignment.source.grid.transform, points.source_px[order]),
+            points.sigma_px[order], points.score[order], sigma, together, weight[order],
+            apply_affine(source.transform, points.source_px[order]),
         ]
     )  # fmt: skip
     return [
@@ -96,13 +96,6 @@ def map_covariance(
     _, in_source = Inverse(header_map(source, reference)).carry(reference_px, covariance_px2)
     unit = affine_matrix(source.transform)[:, :2]
     return np.asarray(np.einsum("ij,njk,lk->nil", unit, in_source, unit))
-
-
-def _covariance_facts(covariance: FloatArray) -> FloatArray:
-    sigma = np.sqrt(covariance[:, (0, 1), (0, 1)])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        together = covariance[:, 0, 1] / (sigma[:, 0] * sigma[:, 1])
-    return np.column_stack([sigma, together])
 
 
 def covariance_of(gcp: Gcp, file: str) -> FloatArray:
