@@ -10,7 +10,7 @@ from geodelreg.errors import MissingExtraError, UsageError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.options import check_header_holds
 from geodelreg.product.figures import draw_tie_points
-from geodelreg.product.motion import HeaderMotion, header_motion
+from geodelreg.product.motion import HeaderMotion, header_motion, metres_per_px
 from geodelreg.product.provenance import provenance_tags
 from geodelreg.product.report import report_dict, short, summary_text, with_metres
 from geodelreg.raster.arrays import is_xarray, placed_again, xarray_dataset
@@ -86,20 +86,25 @@ class Alignment(result.Alignment):
         accuracy = self.accuracy
         return (
             f"<Alignment {self.verdict.outcome.value}: model {self.correction.model}, shift_px "
-            f"({short_signed(right)}, {short_signed(down)}), check_rmse_px "
-            f"{short(accuracy.check_rmse_px)}, {accuracy.kept} tie points>"
+            f"({short_signed(right)}, {short_signed(down)}), uncertainty_px "
+            f"{short(accuracy.uncertainty_px)}, {accuracy.kept} tie points>"
         )
 
     def _repr_html_(self) -> str:
-        motion, accuracy = self.at_centre, self.accuracy
+        motion, accuracy, metres = self.at_centre, self.accuracy, metres_per_px(self)
+
+        def both(px: float) -> str:
+            return with_metres(px, px * metres)
+
         rows = {
             "verdict": self.verdict.outcome.value,
             "source": ", ".join(self.source.paths),
             "reference": ", ".join(self.reference.paths),
             "model": self.correction.model,
             "shift at the centre": with_metres(motion.distance_px, motion.distance_m),
-            "check points, RMSE": with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m),
-            "check points, CE90": with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m),
+            "uncertainty, 95 %": both(accuracy.uncertainty_px),
+            "residual misregistration, RMS": both(accuracy.residual_rms_px),
+            "patch scatter, RMS": both(accuracy.check_rmse_px),
             "tie points kept": f"{accuracy.kept} of {len(self.tie_points)}",
             "warnings": "; ".join(self.warnings),
         }

@@ -24,6 +24,8 @@ def figures_of(alignment: Alignment) -> dict[str, float | str | None]:
         "offset_px": motion.distance_px,
         "offset_m": motion.distance_m,
         "before_rmse_px": accuracy.before_rmse_px,
+        "uncertainty_px": accuracy.uncertainty_px,
+        "residual_rms_px": accuracy.residual_rms_px,
         "check_rmse_px": accuracy.check_rmse_px,
         "check_rmse_m": accuracy.check_rmse_m,
         "check_ce90_px": accuracy.check_ce90_px,

@@ -171,6 +171,8 @@ FIGURES = (
     "offset_px",
     "offset_m",
     "before_rmse_px",
+    "uncertainty_px",
+    "residual_rms_px",
     "check_rmse_px",
     "check_rmse_m",
     "check_ce90_px",

@@ -68,8 +68,7 @@ def rival_correlation(overlay: Overlay) -> Rival:
     signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
     scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
-    reach = 1
-    in_place = float(scores[around(middle_y, reach), around(middle_x, reach)].max())
+    in_place = float(scores[around(middle_y, 1), around(middle_x, 1)].max())
     if in_place <= 0:
         return Rival(float("inf"), float("inf"))
     near = around(middle_y, _NEAR_PX), around(middle_x, _NEAR_PX)

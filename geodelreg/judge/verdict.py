@@ -15,7 +15,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.pair import LATTICE, Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray
-from geodelreg.values.result import Outcome, Reason, Verdict
+from geodelreg.values.result import RADIAL_95, Outcome, Reason, Verdict
 
 MIN_POINTS = 8  # an affine, and one more than twice the three that fix it
 _MAX_LOG_EACH = -2.0  # one alarm in a hundred
@@ -48,8 +48,6 @@ _BANDS_APART = "PAN px at least between the places of two MS bands"
 _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 """What `disagreement_px` compares it with, in our method and in others."""
 _UNCERTAINTY = "PAN px uncertainty (95 %) at the worst corner"
-RADIAL_95 = 1.73
-"""Radius that 95 % of errors stay within, over their root mean square: √(ln 20)."""
 SYSTEMATIC_PX = 0.005  # of PAN; by hand: ½ to 2 × alike
 SIGNIFICANCE = 3.0
 MAX_BANDS_PX = 1.0

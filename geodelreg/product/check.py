@@ -10,7 +10,7 @@ from typing import Any
 from geodelreg.errors import shown
 from geodelreg.product.motion import header_motion
 from geodelreg.product.report import (
-    accuracy_line,
+    accuracy_lines,
     json_text,
     masks_line,
     moved,
@@ -180,7 +180,7 @@ def check_text(check: Check) -> str:
     if check.alignment.verdict.accepted:
         if check.raster_outcome is not CheckOutcome.CANNOT_TELL:
             lines.append(_motion_line(check))
-        lines += [_local_line(check), accuracy_line(check.alignment)]
+        lines += [_local_line(check), *accuracy_lines(check.alignment)]
     if check.alignment.masks:
         lines.append(masks_line(check.alignment))
     if check.bands is not None:
@@ -225,12 +225,13 @@ def _local_line(check: Check) -> str:
         return (
             "Too few tie points agree, or too many lie elsewhere, to tell if one affine is enough."
         )
-    low = check.misalignment.residual_interval_px[0]
-    left = max(check.misalignment.local_px, low if math.isfinite(low) else 0.0)
-    local = f"{short(left)} PAN px RMS of smooth distortion" if left else "no smooth distortion"
     if check.affine_enough:
-        return f"One affine is enough: it leaves {local}."
-    return f"One affine is not enough: it leaves {local}, a local warp is needed."
+        return "One affine is enough."
+    left = max(check.misalignment.local_px, check.misalignment.residual_interval_px[0])
+    return (
+        f"One affine is not enough: it leaves {short(left)} PAN px RMS of smooth distortion, a "
+        "local warp is needed."
+    )
 
 
 def _band_lines(bands: tuple[BandCheck, ...]) -> list[str]:

@@ -87,6 +87,14 @@ def header_motion(alignment: Alignment) -> HeaderMotion:
     )
 
 
+def metres_per_px(alignment: Alignment) -> float:
+    """Metres that one PAN pixel is long on the ground, by its area; NaN where PROJ cannot tell."""
+    try:
+        return math.sqrt(math.prod(gsd_px_m(alignment.reference.grid)))
+    except CrsTransformError:
+        return math.nan
+
+
 def metres_per_unit(source: Grid, at: FloatArray) -> FloatArray:
     """Metres that one map unit is long, along the x and the y axis, near a place of the map.
 

@@ -96,6 +96,7 @@ def provenance_tags(alignment: Alignment) -> dict[str, str]:
         "GEOTRANSFORM_BEFORE": _numbers(correction.original.to_gdal()),
         "GEOTRANSFORM_AFTER": _numbers(after),
         "TIE_POINTS": str(accuracy.kept),
+        "UNCERTAINTY_PX": _rounded(accuracy.uncertainty_px),
         "CHECK_RMSE_PX": _rounded(accuracy.check_rmse_px),
         "CHECK_RMSE_M": _rounded(accuracy.check_rmse_m),
         "CHECK_CE90_PX": _rounded(accuracy.check_ce90_px),

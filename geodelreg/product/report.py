@@ -15,11 +15,11 @@ import numpy as np
 
 from geodelreg.errors import shown
 from geodelreg.options import WriteOptions
-from geodelreg.product.motion import header_motion
+from geodelreg.product.motion import header_motion, metres_per_px
 from geodelreg.product.provenance import source_date
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import FloatArray, Grid
-from geodelreg.values.result import Alignment, BandMap, Outcome
+from geodelreg.values.result import Accuracy, Alignment, BandMap, Outcome
 from geodelreg.version import __version__
 
 SCHEMA_VERSION = "2.0"
@@ -79,7 +79,7 @@ def report_dict(alignment: Alignment, tie_points: bool = False) -> dict[str, Any
             {"step": step, "points": count}
             for step, count in alignment.solution.step_counts.items()
         ],
-        "accuracy": asdict(alignment.accuracy),
+        "accuracy": _accuracy(alignment.accuracy),
         "band_weights": dict(alignment.solution.band_weights),
         "bands": [_band(alignment, band) for band in alignment.solution.bands],
         "masks": [asdict(use) for use in alignment.masks],
@@ -160,6 +160,10 @@ def _correction(alignment: Alignment) -> dict[str, Any]:
     }
 
 
+def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
+    return asdict(accuracy) | {"uncertainty_px": accuracy.uncertainty_px}
+
+
 def _band(alignment: Alignment, band: BandMap) -> dict[str, Any]:
     """Where one band lies, and how it would have to move at its centre."""
     found: dict[str, Any] = {"corrected_geotransform": None, "pixel_map": band.map.to_json()}
@@ -225,7 +229,7 @@ def summary_text(alignment: Alignment, written: WriteOptions | None = None) -> s
     if alignment.verdict.outcome is Outcome.REFUSED:
         lines = _refused_lines(alignment)
     else:
-        lines = [found_line(alignment), accuracy_line(alignment), masks_line(alignment)]
+        lines = [found_line(alignment), *accuracy_lines(alignment), masks_line(alignment)]
         lines.append(next_line(alignment, written))
     return "\n".join(shown(line) for line in lines if line)
 
@@ -252,21 +256,34 @@ def found_line(alignment: Alignment) -> str:
     )
 
 
-def accuracy_line(alignment: Alignment) -> str:
-    """How good the fit is, in one sentence."""
-    accuracy, unit = alignment.accuracy, "PAN px" if alignment.has_pan else "MS px"
+def accuracy_lines(alignment: Alignment) -> list[str]:
+    """How good the fit is, what matters most first: uncertainty, residual, scatter of patches."""
+    accuracy, metres = alignment.accuracy, metres_per_px(alignment)
+
+    def both(px: float) -> str:
+        return with_metres(px, px * metres, "PAN px" if alignment.has_pan else "MS px")
+
+    lines = []
+    if math.isfinite(accuracy.uncertainty_px):
+        lines.append(
+            f"Uncertainty of the correction: {both(accuracy.uncertainty_px)}, 95 % at the worst "
+            "corner."
+        )
+    low, high = map(short, accuracy.residual_interval_px)
+    if math.isfinite(accuracy.residual_rms_px):
+        lines.append(
+            f"Residual misregistration after it: {both(accuracy.residual_rms_px)} RMS (95 %: {low} "
+            f"to {high}), 95th percentile {both(accuracy.residual_p95_px)}."
+        )
     if not math.isfinite(accuracy.check_rmse_px):
-        return f"{accuracy.kept} tie points; too few to measure the accuracy on points left out."
+        return [*lines, f"{accuracy.kept} tie points; too few to measure how patches scatter."]
     text = (
-        f"Accuracy at {accuracy.checked} check points: RMSE "
-        f"{with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m, unit)}, CE90 "
-        f"{with_metres(accuracy.check_ce90_px, accuracy.check_ce90_m, unit)}"
+        f"Patch scatter, the noise of single matches: {both(accuracy.check_rmse_px)} RMS at "
+        f"{accuracy.checked} check points"
     )
-    if math.isfinite(accuracy.before_rmse_px):
-        text += f"; before: {short(accuracy.before_rmse_px)} {unit}"
     if math.isfinite(accuracy.coverage):
-        text += f". They span {100 * accuracy.coverage:.0f} % of the overlap"
-    return text + "."
+        text += f", which span {100 * accuracy.coverage:.0f} % of the overlap"
+    return [*lines, f"{text}."]
 
 
 def masks_line(alignment: Alignment) -> str:

@@ -24,8 +24,9 @@ _LINES = 5.0
 _FIGURES = (
     ("offset_px", "Off by", "How far MS lay off PAN at its centre, PAN pixels"),
     ("misalignment_px", "Misaligned by", "Largest misalignment, PAN pixels"),
-    ("check_rmse_px", "Error", "RMSE at tie points that the fit had not seen, PAN pixels"),
-    ("sigma_corner_px", "Uncertainty", "Standard error at the worst corner, PAN pixels"),
+    ("uncertainty_px", "Uncertainty", "Of the correction, 95 % at the worst corner, PAN pixels"),
+    ("residual_rms_px", "Residual", "RMS of the ground's bend that is left, PAN pixels"),
+    ("check_rmse_px", "Patch scatter", "RMS, the noise of single matches, PAN pixels"),
     ("tie_points", "Tie points", "Tie points kept"),
 )
 _WORST_FIRST = ("failed", "misaligned", "refused", "cannot_tell", "aligned", "already_aligned")

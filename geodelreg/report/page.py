@@ -24,7 +24,7 @@ from geodelreg.report.pictures import Look, Pictures, data_uri, fitting_shape
 from geodelreg.report.places import Place, part_of, places
 from geodelreg.report.residuals import cells, error_map, sigma_map
 from geodelreg.values.raster import FloatArray
-from geodelreg.values.result import Alignment, Outcome
+from geodelreg.values.result import Alignment
 
 _LONGEST_PX = 800
 _ALPHA = 205
@@ -147,15 +147,12 @@ def _closely(place: Place, look: Look) -> dict[str, Any]:
 def _cards(alignment: Alignment) -> Iterator[tuple[str, str, str]]:
     """Label, number and what it means."""
     accuracy, points = alignment.accuracy, alignment.tie_points
-    refused = alignment.verdict.outcome is Outcome.REFUSED
     yield "Error before", _px(accuracy.before_rmse_px), "RMSE at the kept tie points, as delivered"
-    name = "Error where it fits" if refused else "Error after"
-    whose = "of the part that the candidate follows" if refused else "that the fit had not seen"
-    yield name, _px(accuracy.check_rmse_px), f"RMSE at tie points {whose}"
-    yield "Uncertainty", _px(accuracy.sigma_corner_px), "standard error at the worst corner"
+    yield "Uncertainty", _px(accuracy.uncertainty_px), "of the correction, 95 % at the worst corner"
     bend = accuracy.residual_rms_px
-    told = "RMS that one affine leaves" if math.isfinite(bend) else "not measured"
-    yield "Residual bend", _px(bend), told
+    told = "RMS of the ground's bend that is left" if math.isfinite(bend) else "not measured"
+    yield "Residual misregistration", _px(bend), told
+    yield "Patch scatter", _px(accuracy.check_rmse_px), "RMS, the noise of single matches"
     kept = int(points.kept.sum()) or accuracy.kept
     yield "Tie points", f"{kept}", f"kept of {len(points)} tried" if len(points) else "kept"
     if math.isfinite(accuracy.coverage):

@@ -14,7 +14,7 @@ from geodelreg.flags import arguments, as_typed
 from geodelreg.judge.words import region
 from geodelreg.options import AlignOptions
 from geodelreg.product.check import Check, verdict_line
-from geodelreg.product.report import found_line, next_line, short, with_metres
+from geodelreg.product.report import accuracy_lines, found_line, next_line, short
 from geodelreg.report.frame import frame_of
 from geodelreg.report.residuals import elsewhere, local_residual, matched
 from geodelreg.values.points import Status, TiePoints
@@ -258,24 +258,9 @@ def _sentence(text: str) -> str:
 
 
 def _left(alignment: Alignment) -> str:
-    """Residual and uncertainty."""
-    accuracy, parts = alignment.accuracy, []
-    if math.isfinite(accuracy.check_rmse_px):
-        error = with_metres(accuracy.check_rmse_px, accuracy.check_rmse_m)
-        whose = "" if alignment.verdict.accepted else " of the part that was followed"
-        parts.append(f"Tie points{whose} that the fit had not seen miss by {error} (RMSE).")
-    if math.isfinite(accuracy.sigma_corner_px):
-        parts.append(
-            f"The correction is known to {short(accuracy.sigma_centre_px)} PAN px at the centre "
-            f"and {short(accuracy.sigma_corner_px)} PAN px at the worst corner (standard error)."
-        )
-    rms, (low, high) = accuracy.residual_rms_px, accuracy.residual_interval_px
-    if rms > 0:
-        between = f" (95 %: {short(low)} to {short(high)})" if math.isfinite(low + high) else ""
-        parts.append(f"One affine leaves {short(rms)} PAN px RMS of the ground's bend{between}.")
-    elif high >= 0:
-        parts.append(f"One affine leaves no bend of the ground beyond {short(high)} PAN px.")
-    return " ".join(parts)
+    """Uncertainty, residual and scatter; of a refusal those of the part that was followed."""
+    whose = () if alignment.verdict.accepted else ("Of the part that the candidate follows.",)
+    return " ".join((*whose, *accuracy_lines(alignment)))
 
 
 def _elsewhere(alignment: Alignment) -> str:

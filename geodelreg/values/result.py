@@ -16,6 +16,9 @@ from geodelreg.values.points import FitForm, TiePoints
 from geodelreg.values.raster import Grid
 from geodelreg.values.remedies import remedy_for
 
+RADIAL_95 = 1.73
+"""Radius that 95 % of errors stay within, over their root mean square: √(ln 20)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Correction:
@@ -190,6 +193,11 @@ class Accuracy:
     residual_interval_px: tuple[float, float] = (float("nan"), float("nan"))
     kept: int = 0
     checked: int = 0
+
+    @property
+    def uncertainty_px(self) -> float:
+        """Uncertainty of the correction: 95 % of its errors at the worst corner are smaller."""
+        return RADIAL_95 * self.sigma_corner_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)

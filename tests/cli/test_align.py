@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,25 @@ def test_stderr_is_a_summary_without_a_bar(
     assert "check points" in done.stderr
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr
+
+
+def test_summary_tells_the_uncertainty_from_what_is_left_and_from_scatter(
+    aligned: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    folder, done = aligned
+    said = dict(
+        re.findall(r"^(Uncertainty|Residual|Patch).*?: (\S+ PAN px \(\S+ m\))", done.stderr, re.M)
+    )
+    assert list(said) == ["Uncertainty", "Residual", "Patch"]  # what matters most comes first
+    px = {name: float(text.split()[0]) for name, text in said.items()}
+    accuracy = json.loads(done.stdout)["accuracy"]
+    assert px["Uncertainty"] == pytest.approx(accuracy["uncertainty_px"], abs=1e-4)
+    assert px["Residual"] == pytest.approx(accuracy["residual_rms_px"], abs=1e-4)
+    assert px["Patch"] == pytest.approx(accuracy["check_rmse_px"], abs=1e-4)
+    for name, text in said.items():  # a PAN pixel is 10 m
+        assert float(re.findall(r"\((\S+) m", text)[0]) == pytest.approx(10 * px[name], abs=1e-3)
+    assert distance_from_truth_px(transform_of(folder / "out.tif")) < px["Uncertainty"]
+    assert px["Uncertainty"] < px["Patch"]
 
 
 def test_side_files_hold_the_tie_points(

@@ -68,7 +68,7 @@ def test_every_pair_ends_in_one_typed_outcome(folder: Path, geodelreg: Command) 
     assert [row["model"] for row in rows[:2]] == ["scale", "shift"]
     assert [row["error"] for row in rows] == ["", "", "", "RasterNotFoundError"]
     assert "noise.tif were not aligned" in rows[2]["reason"]
-    measured = ("model", "offset_px", "offset_m", "check_rmse_px", "sigma_corner_px")
+    measured = ("model", "offset_px", "offset_m", "check_rmse_px", "uncertainty_px")
     assert {rows[2][name] for name in measured} == {""}
     assert "" not in {rows[0][name] for name in measured}
     assert "none.tif does not exist" in rows[3]["reason"]

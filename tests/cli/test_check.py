@@ -48,6 +48,10 @@ def test_misaligned_is_exit_4_with_how_far_and_which_way(
     assert "7.36 px right, 4.62 px up" in done.stdout
     assert re.search(r"rotation -?0\.000\d°, scale × 1\.0008\d*, × 0\.9993\d*", done.stdout)
     assert "One affine is enough" in done.stdout
+    assert re.search(
+        r"^Uncertainty of the correction: 0\.0\d+ PAN px \(0\.\d+ m\)", done.stdout, re.M
+    )
+    assert re.search(r"^Residual misregistration after it: 0\.00\d+ PAN px", done.stdout, re.M)
     assert "check points" in done.stdout
     assert done.stderr == ""
     assert {path.name for path in folder.iterdir()} == {"ms.tif", "pan.tif"}

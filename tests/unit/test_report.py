@@ -80,7 +80,8 @@ def test_schema_knows_every_status_option_figure_and_model() -> None:
     statuses = properties["tie_points"]["properties"]["by_status"]["properties"]
     assert list(statuses) == [status.name.lower() for status in Status]
     assert set(properties["options"]["properties"]) == {f.name for f in fields(AlignOptions)}
-    assert set(properties["accuracy"]["properties"]) == {f.name for f in fields(Accuracy)}
+    figures = {f.name for f in fields(Accuracy)} | {"uncertainty_px"}
+    assert set(properties["accuracy"]["properties"]) == figures
     models = properties["correction"]["properties"]["model"]["enum"]
     assert set(models) == {"none", *MODELS} - {"auto"}
     outcomes = properties["verdict"]["properties"]["outcome"]["enum"]
@@ -274,8 +275,8 @@ def test_summary_of_a_shift() -> None:
     assert summary_text(alignment()) == (
         "Aligned: MS lay 3.35 PAN px (6.71 m) off PAN; at its centre it moves 3.00 px right, "
         "1.50 px down (model shift).\n"
-        "Accuracy at 4 check points: RMSE 0.0512 PAN px (0.102 m), CE90 0.0700 PAN px (0.140 m); "
-        "before: 3.40 PAN px. They span 87 % of the overlap.\n"
+        "Patch scatter, the noise of single matches: 0.0512 PAN px (0.102 m) RMS at 4 check "
+        "points, which span 87 % of the overlap.\n"
         "Next: the corrected grid is north-up, ready for pansharpening with PAN."
     )
 

@@ -37,7 +37,7 @@ from geodelreg_qgis.tie_points import TiePoint, read_tie_points
 
 OUTPUT, TIE_POINTS, MESH = "OUTPUT", "TIE_POINTS", "MESH"
 GCPS, REPORT, PAGE = "GCPS", "REPORT", "PAGE"
-OUTCOME, CHECK_RMSE_PX = "OUTCOME", "CHECK_RMSE_PX"
+OUTCOME, UNCERTAINTY_PX = "OUTCOME", "UNCERTAINTY_PX"
 
 _GCP_FILES = (
     "QGIS georeferencer (*.points);;GDAL options (*.txt);;GDAL (*.csv);;GeoJSON (*.geojson);;"
@@ -82,7 +82,7 @@ class _Aligning(GeodelregAlgorithm):
                 )
             )
         self.addOutput(QgsProcessingOutputString(OUTCOME, "Outcome"))
-        self.addOutput(QgsProcessingOutputNumber(CHECK_RMSE_PX, "RMSE of check points, PAN pixels"))
+        self.addOutput(QgsProcessingOutputNumber(UNCERTAINTY_PX, "Uncertainty (95 %), PAN pixels"))
 
     def align(
         self,
@@ -108,7 +108,7 @@ class _Aligning(GeodelregAlgorithm):
             found = json.loads(report.read_text(encoding="utf-8"))
         return {
             OUTCOME: found["verdict"]["outcome"],
-            CHECK_RMSE_PX: found["accuracy"]["check_rmse_px"],
+            UNCERTAINTY_PX: found["accuracy"]["uncertainty_px"],
             TIE_POINTS: self._sink(TIE_POINTS, tie_points, parameters, context),
             MESH: self._sink(MESH, tie_points, parameters, context),
             **{name: path for name, path in given.items() if path},

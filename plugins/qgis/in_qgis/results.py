@@ -52,8 +52,8 @@ def align(folder: Path) -> None:
     assert feedback.steps[-1] == 100
     assert points.loadNamedStyle(style("tie_points.qml"))[1]
     say(
-        f"align: {points.featureCount()} tie points, {mesh.featureCount()} triangles, RMSE "
-        f"{done['CHECK_RMSE_PX']:.4f} px"
+        f"align: {points.featureCount()} tie points, {mesh.featureCount()} triangles, known to "
+        f"{done['UNCERTAINTY_PX']:.4f} px"
     )
     bands = processing.run(
         "geodelreg:alignbands",
