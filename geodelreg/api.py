@@ -23,7 +23,7 @@ from geodelreg.judge.check import (
 from geodelreg.judge.words import first_of_many
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
-from geodelreg.pair import Pair, Progress
+from geodelreg.pair import Pair, Progress, check_order
 from geodelreg.product.check import BandCheck, Check, band_check
 from geodelreg.product.provenance import fingerprint, versions
 from geodelreg.raster.inputs import AnyMask, AnyRaster, split_masks
@@ -361,6 +361,7 @@ def _solve(
 ) -> tuple[Pair, Solution]:
     """What the images of two open rasters say."""
     options = rasters.options
+    check_order(rasters.ms, rasters.pan, asked)
     try:
         pair, solution = align_rasters(rasters.ms, rasters.pan, options, progress, rasters.timings)
     except NoDataError as error:

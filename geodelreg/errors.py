@@ -39,7 +39,7 @@ class GeodelregError(Exception):
 
 
 class UsageError(GeodelregError, ValueError):
-    """An option's value is impossible, or two options exclude each other."""
+    """An option's value is impossible, options exclude each other, or MS and PAN are swapped."""
 
     exit_code = 2
 

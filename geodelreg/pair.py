@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from geodelreg.errors import CrsTransformError, UnsupportedGeoreferenceError
+from geodelreg.errors import CrsTransformError, UnsupportedGeoreferenceError, UsageError
 from geodelreg.geo.grid import corners_of, gsd_px_m, outline, window_around
 from geodelreg.geo.maps.header import HeaderMap, header_map
 from geodelreg.geo.maps.smooth import Inverse
@@ -25,6 +26,7 @@ _LARGEST_RATIO = 1e4
 
 LATTICE = 5  # places along either axis of MS at which maps are compared: smooth in between
 _EDGE_PLACES = 16  # on each edge of a footprint: edges of headers in unlike CRSs are curved
+_SWAPPED_RATIO = 1.5  # MS and PAN of one sensor: 2 and more
 _ROUNDING = 1e-6  # of a quotient of pixel sizes that went through a change of CRS
 
 Progress = Callable[[float, str], None]
@@ -162,6 +164,35 @@ def make_pair(
     bands = bands_asked(source, options)
     timings = Timings() if timings is None else timings
     return Pair(source, reference, bands, header, *sizes, options, timings)
+
+
+def check_order(source: WindowReader, reference: WindowReader, options: AlignOptions) -> None:
+    """Refuse PAN in the place of MS: one band of small pixels, against many of large ones.
+
+    Parameters
+    ----------
+    source, reference : WindowReader
+    options : AlignOptions
+        As they were asked for: who names a band of either means it so.
+
+    Raises
+    ------
+    UsageError
+    """
+    ours, theirs = len(source.band_names), len(reference.band_names)
+    if options.band or options.pan_band != 1 or not ours == 1 < theirs:
+        return
+    try:
+        mine, other = (math.sqrt(math.prod(gsd_px_m(one.grid))) for one in (source, reference))
+    except CrsTransformError:
+        return  # told better when the two are related
+    if other >= _SWAPPED_RATIO * mine:
+        raise UsageError(
+            f"{source.name} has one band of {mine:.4g} m pixels, and {reference.name} {theirs} of "
+            f"{other:.4g} m: MS and PAN are swapped",
+            f"MS, which is corrected, comes first: {reference.name} {source.name}. If "
+            f"{source.name} is the one to be corrected, name its band: `band=1`.",
+        )
 
 
 def _check_sizes(source: WindowReader, reference: WindowReader, gsd_m: FloatArray) -> None:

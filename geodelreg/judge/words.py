@@ -76,7 +76,7 @@ def _doubts_of_match(pair: Pair) -> Iterator[str]:
     """What looks as if something else had been meant: questions, for the answer may be yes."""
     source, reference = pair.source, pair.reference
     ours, theirs = len(source.band_names), len(reference.band_names)
-    swapped = not pair.source_is_coarser and ours == 1 < theirs
+    swapped = not pair.source_is_coarser and ours == 1 < theirs and not pair.options.band
     if not pair.source_is_coarser:
         yield (
             f"MS pixels ({pair.source_gsd_m[0]:.4g} m) are finer than the reference's "

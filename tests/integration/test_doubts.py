@@ -1,4 +1,4 @@
-"""What looks as if something else had been meant is asked, and done all the same."""
+"""What looks as if something else had been meant is asked, and done unless it is beyond doubt."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 import rasterio
 
 import geodelreg
+from geodelreg.errors import UsageError
+from geodelreg.values.result import CheckOutcome
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_tiles"
 MS, PAN = SAMPLE / "ms.tif", SAMPLE / "pan.tif"
@@ -23,10 +26,27 @@ def test_the_right_way_round_nothing_is_asked() -> None:
     assert questions(MS, PAN) == []
 
 
-def test_swapped_rasters_are_asked_about() -> None:
-    (question,) = questions(PAN, MS)
-    assert "swapped?" in question
-    assert "4 bands" in question or "PAN 4" in question
+def test_rasters_in_the_wrong_order_are_refused_unless_it_is_said_that_they_are_not() -> None:
+    for ask in (geodelreg.align, geodelreg.check):
+        with pytest.raises(UsageError, match=r"MS and PAN are swapped.*: ms\.tif pan\.tif\."):
+            ask(PAN, MS)
+    meant = geodelreg.align(PAN, MS, band=1)
+    assert meant.correction.corrected != meant.correction.original
+    assert not any("swapped" in warning for warning in meant.warnings)
+    assert geodelreg.check(PAN, MS, pan_band=2).outcome is CheckOutcome.MISALIGNED
+
+
+def test_pixels_a_little_smaller_than_those_of_many_bands_are_asked_about(tmp_path: Path) -> None:
+    reference = tmp_path / "reference.tif"
+    with rasterio.open(PAN) as raster:
+        shape, finer = raster.shape, raster.transform
+        wider = finer @ rasterio.Affine.scale(1.25)
+        data = raster.read(1, out_shape=tuple(int(side / 1.25) for side in shape))
+        profile = raster.profile | {"transform": wider, "count": 3}
+    height, width = data.shape
+    with rasterio.open(reference, "w", **profile | {"height": height, "width": width}) as out:
+        out.write(np.stack([data] * 3))
+    assert any("swapped?" in question for question in questions(PAN, reference))
 
 
 def test_a_reference_of_many_bands_is_asked_about_unless_one_was_named() -> None:
