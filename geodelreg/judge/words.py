@@ -49,6 +49,7 @@ def warnings_of(
     names, asked = pair.source.band_names, bands_asked(pair.source, pair.options)
     if matched and len(asked) < len(names) and not pair.options.band:
         notes.append(f"{len(asked)} of {len(names)} bands of MS, evenly spread, were looked at")
+    notes += _unasked_bands(pair) if matched else ()
     left_out = [names[number - 1] for number in asked if number not in pair.source_bands]
     if matched and left_out:
         notes.append(f"{', '.join(left_out)} of MS showed too little to be matched on")
@@ -89,6 +90,21 @@ def _doubts_of_match(pair: Pair) -> Iterator[str]:
         )
     elif theirs > 1 and pair.options.pan_band == 1:
         yield first_of_many(pair)
+
+
+def _unasked_bands(pair: Pair) -> Iterator[str]:
+    """That bands get a correction that was found without them, where that was asked for."""
+    band, asked = pair.options.band, sorted(set(pair.options.agreeing_bands))
+    knob, told = "band", f"band {band} of MS was matched on"
+    if asked:
+        knob = "agreeing_bands"
+        told = f"bands {', '.join(map(str, asked))} of MS were asked whether they agree"
+    others = len(pair.source.band_names) - (1 if band else len(asked))
+    if (band or asked) and others:
+        yield (
+            f"only {told}; the correction moves {others} more, which may lie elsewhere (without "
+            f"`{knob}` all are asked)"
+        )
 
 
 def first_of_many(pair: Pair) -> str:

@@ -75,6 +75,24 @@ def test_a_band_that_need_not_agree_may_lie_anywhere(tmp_path: Path) -> None:
         geodelreg.align(*pair)
     alignment = geodelreg.align(*pair, agreeing_bands=(2, 3, 4))
     assert not warned(alignment)
+    (said,) = (warning for warning in alignment.warnings if "lie elsewhere" in warning)
+    assert said.startswith("only bands 2, 3, 4 of MS were asked")
+    assert "moves 1 more" in said
+
+
+def test_bands_that_move_with_the_one_that_was_matched_are_told_of(tmp_path: Path) -> None:
+    scene = make_scene(SPEC, sample_imagery(), band_shifts=((8.0, 0.0), STILL, STILL, STILL))
+    write_scene(scene, tmp_path)
+    pair = tmp_path / "ms.tif", tmp_path / "pan.tif"
+    for found in (geodelreg.align(*pair, band=2), geodelreg.check(*pair, band=2).alignment):
+        (said,) = found.to_dict()["warnings"]
+        assert said.startswith("only band 2 of MS was matched on; the correction moves 3 more")
+        assert "(without `band` " in said
+    with rasterio.open(pair[0]) as dataset:
+        second, profile = dataset.read(2), dataset.profile | {"count": 1}
+    with rasterio.open(tmp_path / "one.tif", "w", **profile) as dataset:
+        dataset.write(second, 1)
+    assert geodelreg.align(tmp_path / "one.tif", pair[1], band=1).warnings == ()
 
 
 def test_bands_to_agree_exist_and_are_more_than_one() -> None:
