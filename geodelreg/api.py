@@ -20,7 +20,7 @@ from geodelreg.judge.check import (
     measure_misalignment,
     without_one_place,
 )
-from geodelreg.judge.words import first_of_many
+from geodelreg.judge.words import first_of_many, unmatched_part
 from geodelreg.knobs import AlignKnobs
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair, Progress, check_order
@@ -176,6 +176,7 @@ def align(
         alignment = _alignment(rasters, pair, solution, rasters.notes())
     if not alignment.verdict.accepted:
         failed = [r.message for r in alignment.verdict.reasons if not r.passed]
+        failed += filter(None, [unmatched_part(alignment.tie_points, rasters.ms.grid.shape)])
         raise AlignmentRefusedError(
             f"{rasters.ms.name} and {rasters.pan.name} were not aligned: "
             + "; ".join([*failed, *much_hidden(rasters.ms, rasters.pan)]),

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from geodelreg.fine.layers import LOCAL_RMS_PX, elsewhere, many_elsewhere
+from geodelreg.fine.layers import ELSEWHERE, LOCAL_RMS_PX, elsewhere, many_elsewhere
+from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE
 from geodelreg.fit.choice import spatial_blocks
 from geodelreg.geo.footprint import overlap_windows
 from geodelreg.judge.verdict import Evidence
 from geodelreg.pair import Pair, bands_asked
-from geodelreg.values.points import TiePoints
+from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
 from geodelreg.values.remedies import ROTATES
 from geodelreg.values.result import BandMap
@@ -63,6 +64,7 @@ def warnings_of(
             f"one affine is not enough: {local:.2g} PAN px RMS of smooth distortion is left "
             "(terrain, or bands that do not agree); a local warp would be needed"
         )
+    notes += filter(None, [unmatched_part(points, pair.source.grid.shape)])
     if many_elsewhere(points):
         share, distance = elsewhere(points)
         notes.append(
@@ -126,6 +128,25 @@ def _doubts_of_place(pair: Pair, points: TiePoints) -> Iterator[str]:
             f"the headers put MS {far_km:.3g} km away from PAN, where the two do not overlap: is "
             "the CRS of MS, its UTM zone for instance, the right one?"
         )
+
+
+def unmatched_part(points: TiePoints, shape: tuple[int, int]) -> str:
+    """Which side of a raster of so many rows and columns shows something that matches nothing.
+
+    Empty where no such patches lie together: what matches here and there is usual.
+    """
+    missing = np.isin(points.status, (Status.CONVERGENCE, Status.CORRELATION))
+    asked = missing | points.kept | np.isin(points.status, ELSEWHERE)
+    count, every = int(missing.sum()), int(asked.sum())
+    if count < LEAST_PATCHES or not LEAST_SHARE <= count / every < _MOSTLY:
+        return ""
+    where = region(points.source_px[asked], missing[asked], shape[::-1])
+    if not where.startswith("the "):
+        return ""
+    return (
+        f"{count} of {every} patches that show something match nothing near where the others say: "
+        f"{where} of them, which clouds or changes may hide, or which may lie elsewhere"
+    )
 
 
 def unheard_bands(pair: Pair, bands: Sequence[BandMap]) -> tuple[str, ...]:

@@ -34,9 +34,10 @@ _TITLES = {
     "typical": "Typical place",
     "best": "Best place",
     "middle": "Middle of the common ground",
+    "unmatched": "Where nothing matched",
 }
 _SHAPES = ("cross", "triangle", "diamond", "plus", "ring", "dot")
-_PLACE_MARKS = "123"
+_PLACE_MARKS = "1234"
 
 
 def page(alignment: Alignment, check: Check | None = None) -> str:
@@ -127,7 +128,7 @@ def _look(look: Look) -> dict[str, Any]:
 
 
 def _closely(place: Place, look: Look) -> dict[str, Any]:
-    told = "No point tells what is left here."
+    told = f"In the {place.where}: no point tells what is left here."
     if math.isfinite(place.distance_px):
         told = (
             f"In the {place.where}: after the correction MS lies {short(place.distance_px)} PAN px "

@@ -8,7 +8,7 @@ import numpy as np
 
 from geodelreg.report.drawing import spread
 from geodelreg.report.frame import Frame
-from geodelreg.report.residuals import matched
+from geodelreg.report.residuals import WORTH_A_WORD, matched, unmatched
 from geodelreg.values.points import TiePoints
 from geodelreg.values.raster import FloatArray, Window
 
@@ -31,7 +31,8 @@ class Place:
     Attributes
     ----------
     name : str
-        ``worst``, ``typical``, ``best``; ``middle`` when no point tells them apart.
+        ``worst``, ``typical``, ``best``; ``middle`` when no point tells them apart; ``unmatched``
+        where many patches match nothing.
     window : Window
         Of PAN.
     residual_px : (float, float)
@@ -53,6 +54,8 @@ class Place:
 
 def places(points: TiePoints, frame: Frame) -> list[Place]:
     """The worst, a typical and the best place, by what all points say that matched in each.
+
+    And the place where most match nothing, if many do.
 
     Places with few patches, where much is missing, or that few of the patches matched in, are none
     of them where there are others.  The typical one has the median of their residuals.
@@ -88,7 +91,20 @@ def places(points: TiePoints, frame: Frame) -> list[Place]:
         Place(name, windows[i], (float(residual[i, 0]), float(residual[i, 1])),
               part_of(_middle(windows[i]), window))
         for name, i in chosen.items()
-    ]  # fmt: skip
+    ] + _unmatched(points, frame)  # fmt: skip
+
+
+def _unmatched(points: TiePoints, frame: Frame) -> list[Place]:
+    """Where most patches match nothing; none where few do."""
+    away = unmatched(points) & _within(points.reference_px, frame.window)
+    if away.sum() <= WORTH_A_WORD * len(points):
+        return []
+    asked = spread(points.reference_px, np.flatnonzero(away), _MOST_ASKED)
+    windows = [_window(at, frame) for at in points.reference_px[asked]]
+    lost = [_within(points.reference_px, part) for part in windows]
+    part = windows[int(np.argmax([away[i].sum() - points.kept[i].sum() for i in lost]))]
+    nowhere = float("nan"), float("nan")
+    return [Place("unmatched", part, nowhere, part_of(_middle(part), frame.window))]
 
 
 def _within(xy: FloatArray, window: Window) -> np.ndarray:

@@ -7,9 +7,11 @@ import numpy as np
 from geodelreg.fine.layers import ELSEWHERE
 from geodelreg.geo.maps.kriging import distances
 from geodelreg.report.frame import Frame
-from geodelreg.values.points import TiePoints
+from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
+WORTH_A_WORD = 0.3
+"""Of all points: fewer tell too little, or match nothing, in any good pair."""
 NEIGHBOURS = 8
 """Points whose median is taken: three gross mismatches among them change little."""
 _CELLS = 48
@@ -27,6 +29,11 @@ def elsewhere(points: TiePoints) -> BoolArray:
 def matched(points: TiePoints) -> BoolArray:
     """(M,) True for points that matched anywhere, kept or not."""
     return np.asarray((points.kept & _finite(points)) | elsewhere(points))
+
+
+def unmatched(points: TiePoints) -> BoolArray:
+    """(M,) True for points that show something, and match nothing near where the others say."""
+    return np.asarray(np.isin(points.status, (Status.CONVERGENCE, Status.CORRELATION)))
 
 
 def _finite(points: TiePoints) -> BoolArray:

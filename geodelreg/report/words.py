@@ -16,7 +16,7 @@ from geodelreg.options import AlignOptions
 from geodelreg.product.check import Check, verdict_line
 from geodelreg.product.report import accuracy_lines, found_line, next_line, short
 from geodelreg.report.frame import frame_of
-from geodelreg.report.residuals import elsewhere, local_residual, matched
+from geodelreg.report.residuals import WORTH_A_WORD, elsewhere, local_residual, matched, unmatched
 from geodelreg.values.points import Status, TiePoints
 from geodelreg.values.raster import BoolArray, FloatArray
 from geodelreg.values.result import Alignment, CheckOutcome, Outcome, Reason
@@ -52,12 +52,10 @@ STATUS = {
     Status.EXCLUDED: "not enabled",
 }
 
-_SILENT = (Status.TEXTURE, Status.CONVERGENCE, Status.CORRELATION)
-
 
 def is_telling(status: Status) -> bool:
     """False of points that merely showed too little to be matched."""
-    return status not in _SILENT
+    return status is not Status.TEXTURE
 
 
 REASONS = {
@@ -148,7 +146,6 @@ _AT_LEAST = ("tie_points", "coverage", "support", "field_points")
 _WORST = 2.0
 _WORTH_A_WORD = 0.05
 """Of the patches that matched: fewer lie elsewhere in any good pair."""
-_WORTH_A_WORD_SILENT = 0.3
 _MOSTLY = 0.75
 _ALL_OVER = "all over the picture"
 _TOGETHER = 0.4
@@ -223,7 +220,15 @@ def story(alignment: Alignment, check: Check | None = None) -> list[str]:
             told += f". {_candidate(alignment)}"
     else:
         told = found_line(alignment).partition(": ")[2].removesuffix(".")
-    texts = [_elsewhere(alignment), _silent(alignment), _left(alignment)]
+    points = alignment.tie_points
+    nothing = "match nothing near where the others say, though they show something"
+    silent = "showed nothing to match, as water does, or were left out"
+    texts = [
+        _elsewhere(alignment),
+        _unheard(alignment, unmatched(points), nothing),
+        _unheard(alignment, points.status == Status.TEXTURE, silent),
+        _left(alignment),
+    ]
     if alignment.verdict.accepted:
         texts.reverse()
     return [f"{_sentence(told)}.", *(text for text in texts if text)]
@@ -307,17 +312,12 @@ def _pattern(points: TiePoints, away: BoolArray, length_px: float) -> str:
     return "each in its own direction, as clouds and changed ground do"
 
 
-def _silent(alignment: Alignment) -> str:
-    """How many patches showed too little to be matched, and where they are."""
-    status = alignment.tie_points.status
-    every = np.ones(len(status), dtype=np.bool_)
-    silent = np.isin(status, _SILENT)
-    if silent.sum() <= _WORTH_A_WORD_SILENT * len(status) or not len(status):
+def _unheard(alignment: Alignment, some: BoolArray, told: str) -> str:
+    """How many patches have this fate, and where they are; empty of a few."""
+    if some.sum() <= WORTH_A_WORD * len(some):
         return ""
-    return (
-        f"{int(silent.sum())} of {len(status)} patches showed nothing to match, as clouds or "
-        f"water do, or were left out: {_region(alignment, every, silent)}."
-    )
+    every = np.ones(len(some), dtype=np.bool_)
+    return f"{int(some.sum())} of {len(some)} patches {told}: {_region(alignment, every, some)}."
 
 
 def _region(alignment: Alignment, some: BoolArray, member: BoolArray) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import rasterio
 
 import geodelreg
-from geodelreg.errors import UsageError
+from geodelreg.errors import AlignmentRefusedError, UsageError
 from geodelreg.values.result import CheckOutcome
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_tiles"
@@ -47,6 +48,23 @@ def test_pixels_a_little_smaller_than_those_of_many_bands_are_asked_about(tmp_pa
     with rasterio.open(reference, "w", **profile | {"height": height, "width": width}) as out:
         out.write(np.stack([data] * 3))
     assert any("swapped?" in question for question in questions(PAN, reference))
+
+
+@pytest.mark.parametrize("px", [5, 40])
+def test_a_side_that_lies_too_far_off_to_be_found_is_told_of(px: int, tmp_path: Path) -> None:
+    with rasterio.open(MS) as raster:
+        image, profile = raster.read(), raster.profile
+    half = image.shape[1] // 2
+    image[:, half:] = np.roll(image, px, axis=2)[:, half:]
+    with rasterio.open(tmp_path / "torn.tif", "w", **profile) as out:
+        out.write(image)
+    try:
+        told = "; ".join(geodelreg.align(tmp_path / "torn.tif", PAN).warnings)
+    except AlignmentRefusedError as refusal:
+        told = refusal.cause
+    assert re.search(
+        r"\d+ of \d+ patches that show something match nothing near .*: the (upp|low)er", told
+    )
 
 
 def test_a_reference_of_many_bands_is_asked_about_unless_one_was_named() -> None:

@@ -89,7 +89,7 @@ def cloudy() -> Alignment:
         (bent(), ("in directions that change gradually, as if the picture were bent",)),
         (
             cloudy(),
-            ("patches showed nothing to match, as clouds or water do", "in the upper left of",
+            ("patches showed nothing to match, as water does", "in the upper left of",
              "each in its own direction, as clouds"),
         ),
     ],
@@ -122,6 +122,20 @@ def test_the_story_of_a_good_pair_alarms_nobody() -> None:
     assert "MS lay" in text
     for alarming in ("elsewhere", "torn", "bent", "nothing to match"):
         assert alarming not in text
+
+
+def test_where_nothing_matched_is_told_and_shown() -> None:
+    lower = lattice()[:, 1] > 0.55
+    points = patches(noise(0.02), np.zeros(SIDE * SIDE, dtype=bool))
+    points = replace(points, status=np.where(lower, Status.CONVERGENCE, points.status))
+    made = alignment(tie_points=points, verdict=REFUSED)
+    text = " ".join(story(made))
+    assert "60 of 144 patches match nothing near where the others say" in text
+    assert "the lower" in text
+    assert "as water does" not in text
+    *_, last = places(made.tie_points, frame_of(made))
+    assert last.name == "unmatched"
+    assert last.where.startswith("lower")
 
 
 def test_the_worst_place_lies_where_the_fault_is_and_the_best_does_not() -> None:
