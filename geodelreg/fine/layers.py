@@ -341,7 +341,7 @@ class Claim(NamedTuple):
 
 def keypoints_apart(
     pair: Pair, guess: Guess, heard: Sequence[Claim], correction: PixelMap, points: TiePoints
-) -> float:
+) -> tuple[float, FloatArray]:
     """How far from a correction keypoints that agree with more certainty put its tie points.
 
     They were refused, where too little is in sight or clouds are about; that makes a place which
@@ -359,18 +359,21 @@ def keypoints_apart(
 
     Returns
     -------
-    float
-        Median distance, in pixels of the coarser raster; 0 when nobody is more certain.
+    distance : float
+        Median, in pixels of the coarser raster; 0 when nobody is more certain.
+    move_px : (2,) float64
+        Median from where the correction puts the tie points to there, PAN pixels.
     """
     source_px = points.source_px[points.kept]
     here = pair.to_reference(correction).forward(source_px)
-    apart = [
-        float(np.median(np.hypot(*(here - pair.to_reference(other.map).forward(source_px)).T)))
-        / pair.pan_px_per_coarser_px
+    moves = [
+        pair.to_reference(other.map).forward(source_px) - here
         for other in heard
         if len(source_px) and other.log_nfa < SURE_LOG_NFA and not guess.log_nfa < other.log_nfa
     ]
-    return max(apart, default=0.0)
+    apart = [(float(np.median(np.hypot(*move.T))), np.median(move, axis=0)) for move in moves]
+    distance_px, move_px = max(apart, key=lambda one: one[0], default=(0.0, np.zeros(2)))
+    return distance_px / pair.pan_px_per_coarser_px, move_px
 
 
 def elsewhere(points: TiePoints) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from geodelreg.judge.repeated import proof_without_repeated
 from geodelreg.judge.rival import Rival, rival_correlation
 from geodelreg.judge.unshared import unshared_share
 from geodelreg.judge.verdict import Evidence
-from geodelreg.judge.words import BANDS_TOLD_PX
+from geodelreg.judge.words import BANDS_TOLD_PX, followed_part
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
@@ -72,6 +72,7 @@ def gather(
         apart, told = ask_bands(guess, refined, correction, told_px, pool)
         (accuracy, rival), area, repeated = whole.result(), places.result(), repeats.result()
     turn_deg, scale = turn_and_scale(pair, correction)
+    keypoints_px, keypoints_move = keypoints_apart(pair, guess, heard, correction, fitted.points)
     return accuracy, Evidence(
         points=accuracy.kept,
         log_nfa=fitted.log_nfa,
@@ -91,7 +92,8 @@ def gather(
         bands_apart=apart.distance_px * pair.pan_px_per_source_px / part.pan_px_per_patch_px,
         bands=told.distance_px * pair.pan_px_per_source_px,
         bands_words=told.words,
-        keypoints_apart=keypoints_apart(pair, guess, heard, correction, fitted.points),
+        keypoints_apart=keypoints_px,
+        keypoints_words=followed_part(fitted.points, pair, keypoints_move),
     )
 
 

@@ -36,10 +36,7 @@ _LIMITS = (
     ("bands_apart", "≤", 0.5, "coarser px between the places of two MS bands, as of clouds"),
 )
 """Name of the evidence, what it must be, and the words for it; docs/gate.md says why so much."""
-_LAST_LIMITS = (
-    ("keypoints_apart", "≤", 2.0, "coarser px from where keypoints, more certain, put the ground"),
-)
-"""After what the user asked: further is another place, and no inaccuracy of keypoints."""
+_KEYPOINTS = "coarser px from where keypoints, more certain, put the ground"
 _OF_BANDS = ("bands_apart", "bands")
 """Not asked where each band is corrected by itself."""
 OF_THE_WHOLE = ("two_motions", "local")
@@ -50,6 +47,8 @@ _APART_FROM = {True: "half of the tie points", False: "the patches around it"}
 _UNCERTAINTY = "PAN px uncertainty (95 %) at the worst corner"
 SYSTEMATIC_PX = 0.005  # of PAN; by hand: ½ to 2 × alike
 SIGNIFICANCE = 3.0
+MAX_KEYPOINTS_APART = 2.0
+"""Coarser pixels: further is another place, and no inaccuracy of keypoints."""
 MAX_BANDS_PX = 1.0
 """Between two MS bands: no one correction is right for both to half a PAN pixel."""
 
@@ -89,6 +88,8 @@ class Evidence:
         standard errors.
     keypoints_apart : float
         Coarser pixels between the correction and what stronger, refused keypoint matches say.
+    keypoints_words : str
+        Which part the correction follows, and how that lies to the ground by the keypoints.
     residual_low_px : float
         Lower end of the 95 % interval of what the correction leaves of the ground's smooth map.
     moved : float
@@ -129,6 +130,7 @@ class Evidence:
     words: str = ""
     bands: float = 0.0
     bands_words: str = ""
+    keypoints_words: str = ""
     strain: float = 0.0
     repeated: float | None = None
     repeated_words: str = ""
@@ -146,7 +148,9 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
     which = f": {evidence.bands_words}" if evidence.bands_words else ""
     most_px = options.max_residual_px if options.on_local == "refuse" else None
     repeated = _MAX_LOG_TOGETHER if evidence.repeated is not None else None
+    from_here = f": {evidence.keypoints_words}" if evidence.keypoints_words else ""
     whole = (
+        ("keypoints_apart", "≤", MAX_KEYPOINTS_APART, f"{_KEYPOINTS}{from_here}"),
         ("max_uncertainty", "≤", options.max_uncertainty_px, _UNCERTAINTY),
         ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
         ("bands", "≤", MAX_BANDS_PX, f"{_BANDS_APART}{which}"),
@@ -165,7 +169,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         "local": evidence.residual_low_px,
     }
     reasons = []
-    for name, relation, limit, what in (*_LIMITS, *_asked(options), *_LAST_LIMITS, *whole):
+    for name, relation, limit, what in (*_LIMITS, *_asked(options), *whole):
         if limit is not None and not (options.per_band and name in _OF_BANDS):
             apart_from = _APART_FROM[options.method == "delaunay"] if what.endswith("and") else ""
             words = f"{what} {apart_from}".rstrip()

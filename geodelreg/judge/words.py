@@ -225,6 +225,17 @@ def region(xy: FloatArray, member: BoolArray, size: tuple[float, float]) -> str:
     return f"{share} in the {where}"
 
 
+def followed_part(points: TiePoints, pair: Pair, move_px: FloatArray) -> str:
+    """Which part a correction follows, and where that lies by others, (2,) PAN pixels off."""
+    if not points.kept.any() or not move_px.any():
+        return ""
+    where = region(points.source_px, points.kept, pair.source.grid.shape[::-1])
+    return (
+        f"{where}, which this follows, {lies(move_px, 'it')}, as clouds do, or a part that is "
+        "displaced"
+    )
+
+
 def lies(move_px: FloatArray, rest: str = "the rest") -> str:
     """Where a part lies that is (2,) PAN pixels right and down of the rest, in words."""
     right, down = (float(v) for v in move_px)

@@ -131,7 +131,8 @@ FAILED = {
     "strain": "The field is so steep somewhere that it would fold the ground.",
     "field_points": "Too few points are left to follow a bend.",
     "field_clouds": "A field would follow the clouds.",
-    "keypoints_apart": "Distinct features say another place than the patches.",
+    "keypoints_apart": "Distinct features say another place than the patches, which may "
+    "have followed clouds.",
     "max_shift": "The shift is larger than you allowed.",
     "max_rotation": "The rotation is larger than you allowed.",
     "max_uncertainty": "The place is less well known than you allowed.",

@@ -42,6 +42,16 @@ _REMEDIES = (
         ),
     ),
     (
+        {"keypoints_apart", "rival_motion", "support"},
+        (
+            "Much of the ground lies elsewhere than the part that was followed, which may be "
+            "clouds: mask them (`mask`). A raster of which a part is displaced can be cut there "
+            "(gdal_translate -srcwin) and aligned part by part. Where there are neither, look "
+            "whether both rasters show the same ground, and whether `band` names a band that looks "
+            "more like PAN."
+        ),
+    ),
+    (
         {"bands", "bands_apart"},
         (
             "The bands of MS do not agree, or show clouds: correct each by itself "

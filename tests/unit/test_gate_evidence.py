@@ -326,5 +326,6 @@ def test_stronger_keypoints_are_heeded_after_a_refusal(
     before = Claim(AffineMap(Affine.translation(apart_px, 0)), log_nfa_before)
     own = Guess(IDENTITY, log_nfa_own, {}, images)
     points = tie_points(np.zeros((9, 2)), np.zeros(9, np.uint8))
-    apart = keypoints_apart(pair, own, [before], IDENTITY, points)
+    apart, move_px = keypoints_apart(pair, own, [before], IDENTITY, points)
     assert (apart <= MAX_KEYPOINTS_APART) is passes
+    assert np.hypot(*move_px) == pytest.approx(apart)
