@@ -56,7 +56,9 @@ class _Rasters:
         ms, pan = self.ms, self.pan
         files = [one for one in (self.source, self.reference) if not one.in_memory]
         unsure = [unsettled(Path(path)) for one in files for path in one.paths]
-        notes = (*self.early_notes, ms.block_note, pan.block_note, *unsure, *mask_warnings(ms, pan))
+        notes = [*self.early_notes, ms.block_note, pan.block_note, *unsure, *mask_warnings(ms, pan)]
+        if ms is not pan and self.source.fingerprints == self.reference.fingerprints != ("",):
+            notes.append("MS and PAN are the same file: that they agree proves nothing")
         return tuple(dict.fromkeys(note for note in notes if note))
 
 

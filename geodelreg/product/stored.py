@@ -16,7 +16,7 @@ from geodelreg.geo.grid import outline
 from geodelreg.geo.maps.affine import AffineMap
 from geodelreg.geo.maps.header import header_map
 from geodelreg.geo.maps.smooth import Inverse
-from geodelreg.product.provenance import FINGERPRINTS, provenance_tags, written_tags
+from geodelreg.product.provenance import FINGERPRINTS, fingerprint, provenance_tags, written_tags
 from geodelreg.product.reading import read_report
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import FloatArray, Grid
@@ -132,12 +132,17 @@ class StoredCorrection:
         self.check_share(name, float(common))
 
     def check_uncorrected(self, file: Path) -> None:
-        """Refuse a raster that was corrected by an alignment of the same pair.
+        """Refuse a raster that was corrected by an alignment of the same pair, and PAN itself.
 
         Raises
         ------
         CorrectionMisfitError
         """
+        if fingerprint(file) == self.tags.get("GEODELREG_PAN_FINGERPRINT"):
+            raise CorrectionMisfitError(
+                f"{file} is the PAN that the correction of MS was found by: it lies right",
+                "Apply it to files that lie as MS did, or add `force=True`.",
+            )
         found = {name: text for name, text in written_tags(file).items() if name in FINGERPRINTS}
         if found and all(self.tags.get(name) == text for name, text in found.items()):
             raise CorrectionMisfitError(

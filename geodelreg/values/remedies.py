@@ -82,6 +82,14 @@ _REMEDIES = (
         ),
     ),
     (
+        {"disagreement_px"},
+        (
+            "Not all tie points tell the same correction: a simpler `model` is told more surely, "
+            "and `method='delaunay'` finds more of them; where the ground bends, `warp=True` "
+            "follows it."
+        ),
+    ),
+    (
         {"sigma_px", "coverage", "disagreement_px"},
         (
             "Too little of the overlap shows common ground to know its corners: a simpler `model` "

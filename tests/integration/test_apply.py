@@ -338,3 +338,5 @@ def test_what_was_corrected_is_not_corrected_again_unless_forced(tmp_path: Path)
     geodelreg.revert(mask)
     geodelreg.apply(report, mask)
     geodelreg.apply(report, mask, force=True)
+    with pytest.raises(CorrectionMisfitError, match="is the PAN that the correction"):
+        geodelreg.apply(report, pair[1], tmp_path / "moved.tif")

@@ -73,6 +73,11 @@ def test_a_reference_of_many_bands_is_asked_about_unless_one_was_named() -> None
     assert questions(MS, MS, pan_band=2) == []
 
 
+def test_one_file_in_both_places_proves_nothing() -> None:
+    (said,) = geodelreg.align(PAN, PAN).warnings
+    assert "the same file" in said
+
+
 def test_of_a_reference_of_many_bands_the_one_most_like_the_others_is_taken(tmp_path: Path) -> None:
     pan = tmp_path / "pan.tif"
     with rasterio.open(PAN) as raster:
