@@ -265,7 +265,7 @@ def run(request: Request, find: Callable[[Progress], Alignment]) -> None:
         click.echo(shown(_named(request)), err=True)
         click.echo(as_typed(summary_text(alignment, request.write_options)), err=True)
         click.echo(_step_counts(alignment), err=True)
-        click.echo(shown(_written(request)), err=True)
+        click.echo(shown(_written(alignment, request)), err=True)
 
 
 def _keep_candidate(alignment: Alignment, request: Request) -> None:
@@ -289,15 +289,17 @@ def _named(request: Request) -> str:
     return f"MS {request.sources[0]}{more}{known}"
 
 
-def _written(request: Request) -> str:
+def _written(alignment: Alignment, request: Request) -> str:
     """The outputs, in one line."""
+    from geodelreg.values.result import Outcome
+
     paths = [
         request.output, *request.gcps, *request.report, request.displacement, request.figure
     ]  # fmt: skip
     names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
-    if request.in_place:
+    if request.in_place and alignment.verdict.outcome is Outcome.ALIGNED:
         names = f"the header of MS{', ' if names else ''}{names}"
-    return f"Written: {names}" if names else "Written: nothing (dry run)"
+    return f"Written: {names or 'nothing'}{' (dry run)' if request.dry_run and not names else ''}"
 
 
 def _step_counts(alignment: Alignment) -> str:

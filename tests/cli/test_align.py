@@ -178,6 +178,9 @@ def test_in_place_and_back(geodelreg: Command, pair: Path) -> None:
     done = geodelreg("align", "ms.tif", "pan.tif", "--in-place", cwd=pair)
     assert done.returncode == 0, done.stderr
     assert distance_from_truth_px(transform_of(pair / "ms.tif")) < 0.05
+    assert done.stderr.splitlines()[-1] == "Written: the header of MS"
+    done = geodelreg("align", "ms.tif", "pan.tif", "--in-place", cwd=pair)
+    assert done.stderr.splitlines()[-1] == "Written: nothing"
     done = geodelreg("revert", "ms.tif", cwd=pair)
     assert done.returncode == 0
     assert done.stderr == "ms.tif: original georeferencing is back\n"
