@@ -10,6 +10,7 @@ No low-order resampler takes part.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -26,8 +27,7 @@ FULL_SCALE = 4095
 READ_NOISE = 1.5
 SHOT_NOISE = 0.008
 SPLINE_ORDER: Literal[5] = 5
-READ_NOISE = 1.5
-SHOT_NOISE = 0.008
+KEPT_UP_TO_PX = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,28 +88,55 @@ def render(field: NDArray[np.floating], placement: Placement, blur_ms_px: float)
     (h, w) float64
         Noise-free band.
     """
-    from scipy import fft, ndimage
+    from scipy import ndimage
 
-    ratio = float(np.sqrt(abs(np.linalg.det(placement.linear))))
-    pad = int(np.ceil(PSF_REACH_MS_PX * ratio)) + TAPER_PX
-    padded = _periodic(field, pad)
-    size = padded.shape
-    spectrum = fft.rfft2(padded, workers=2)
-    fy, fx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None, :]
-    for rows in np.array_split(np.arange(size[0]), max(1, size[0] // 512)):
-        spectrum[rows] *= system_mtf(fx, fy[rows], placement.linear, blur_ms_px).astype(
-            spectrum.real.dtype
-        )
-    factor = 2 if ratio < OVERSAMPLE_BELOW_RATIO else 1
-    smooth = _inverse(spectrum, size, factor)
+    smooth = _kept_blurred if field.size <= KEPT_UP_TO_PX else _blurred
+    spline, pad, factor = smooth(
+        *(field.tobytes(), field.shape, field.dtype.str, float(field.mean())),
+        *(tuple(placement.linear.ravel().tolist()), blur_ms_px),
+    )
     index = (placement.centres_px - 0.5 + pad) * factor
     sampled = ndimage.map_coordinates(
-        smooth, np.stack([index[..., 1], index[..., 0]]), order=SPLINE_ORDER, mode="mirror"
+        spline,
+        np.stack([index[..., 1], index[..., 0]]),
+        output=field.dtype,
+        order=SPLINE_ORDER,
+        mode="mirror",
+        prefilter=False,
     )
     return np.asarray(sampled, dtype=np.float64)
 
 
-def _periodic(field: NDArray[np.floating], pad: int) -> NDArray[np.floating]:
+def _blurred(
+    pixels: bytes,
+    shape: tuple[int, ...],
+    dtype: str,
+    mean: float,
+    linear: tuple[float, ...],
+    blur_ms_px: float,
+) -> tuple[FloatArray, int, int]:
+    """Coefficients of the spline of a field as MS pixels see it, its margin and its density."""
+    from scipy import fft, ndimage
+
+    steps = np.reshape(linear, (2, 2))
+    ratio = float(np.sqrt(abs(np.linalg.det(steps))))
+    pad = int(np.ceil(PSF_REACH_MS_PX * ratio)) + TAPER_PX
+    padded = _periodic(np.frombuffer(pixels, dtype).reshape(shape), pad, mean)
+    size = padded.shape
+    spectrum = fft.rfft2(padded, workers=2)
+    fy, fx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None, :]
+    for rows in np.array_split(np.arange(size[0]), max(1, size[0] // 512)):
+        spectrum[rows] *= system_mtf(fx, fy[rows], steps, blur_ms_px).astype(spectrum.real.dtype)
+    factor = 2 if ratio < OVERSAMPLE_BELOW_RATIO else 1
+    smooth = _inverse(spectrum, size, factor)
+    return ndimage.spline_filter(smooth, SPLINE_ORDER, mode="mirror"), pad, factor
+
+
+_kept_blurred = lru_cache(maxsize=4)(_blurred)
+"""The four bands of small ground are rendered time and again, each time into another place."""
+
+
+def _periodic(field: NDArray[np.floating], pad: int, mean: float) -> NDArray[np.floating]:
     """The field mirrored by `pad` pixels, or more, then fading to its mean: no jump at the seam."""
     from scipy import fft
 
@@ -119,15 +146,15 @@ def _periodic(field: NDArray[np.floating], pad: int) -> NDArray[np.floating]:
         while length % 2:
             length = fft.next_fast_len(length + 1)
         widths.append((pad, length - n - pad))
-    mean = field.dtype.type(field.mean())
-    padded = np.pad(field, widths, mode="symmetric") - mean
+    level = field.dtype.type(mean)
+    padded = np.pad(field, widths, mode="symmetric") - level
     ramp = (np.arange(TAPER_PX) + 0.5) / TAPER_PX
     fade = (0.5 - 0.5 * np.cos(np.pi * ramp)).astype(field.dtype)
     padded[:TAPER_PX] *= fade[:, None]
     padded[-TAPER_PX:] *= fade[::-1, None]
     padded[:, :TAPER_PX] *= fade
     padded[:, -TAPER_PX:] *= fade[::-1]
-    return np.asarray(padded + mean)
+    return np.asarray(padded + level)
 
 
 def _inverse(
