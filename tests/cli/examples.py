@@ -16,10 +16,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.cli import forked
+from tests.cli.helpers import ROOT, command_server
+
 PYTHON = shlex.quote(sys.executable)
 PRELUDE = f"""set -e
-geodelreg() {{ {PYTHON} -m geodelreg_cli "$@"; }}
+geodelreg() {{ {PYTHON} -S {shlex.quote(forked.__file__)} "$GEODELREG_SERVER" "$@"; }}
 rio() {{ {PYTHON} -c 'from rasterio.rio.main import main_group; main_group()' "$@"; }}
 dask() {{ exec {PYTHON} -m dask "$@"; }}
 """
@@ -68,7 +70,8 @@ def run_examples(page: str, folder: Path, port: int, languages: str = "sh|python
             continue
         done = subprocess.run(
             ["bash", "-m", "-c", PRELUDE + block], cwd=folder, capture_output=True, text=True,
-            timeout=300, env=os.environ | {"COLUMNS": "100"},
+            timeout=300,
+            env=os.environ | {"COLUMNS": "100", "GEODELREG_SERVER": command_server()},
         )  # fmt: skip
         printed = done.stdout + done.stderr
         assert done.returncode == 0, f"{block}\n{printed}"

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import rasterio
+
+from tests.cli import forked
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "sample_tiles"
@@ -19,11 +25,40 @@ COMMAND = (sys.executable, "-m", "geodelreg_cli")
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
+@cache
+def command_server() -> str:
+    """Address of the process that `forked.ask` has the command run by, while the tests run."""
+    folder = tempfile.mkdtemp()
+    address = f"{folder}/socket"
+    server = subprocess.Popen(
+        [sys.executable, forked.__file__, address], stdin=subprocess.PIPE, start_new_session=True
+    )
+
+    def stop() -> None:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.communicate()
+        shutil.rmtree(folder)
+
+    atexit.register(stop)
+    while not Path(address).exists():
+        assert server.poll() is None
+    return address
+
+
 def run_command(*args: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """``geodelreg ARGS`` with its output captured."""
-    command = [*COMMAND, *map(str, args)]
-    env = os.environ | {"COLUMNS": "100"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, timeout=120)
+    words = list(map(str, args))
+    with tempfile.TemporaryFile("w+") as stdout, tempfile.TemporaryFile("w+") as stderr:
+        streams = [0, stdout.fileno(), stderr.fileno()]
+        folder, env = str(cwd or Path.cwd()), os.environ | {"COLUMNS": "100"}
+        code = forked.ask(command_server(), words, folder, env, streams)
+        texts = [stream.seek(0) or stream.read() for stream in (stdout, stderr)]
+    return subprocess.CompletedProcess(words, code, *texts)
+
+
+def run_fresh_command(*args: object, cwd: Path) -> None:
+    """``geodelreg ARGS`` in a new interpreter, which orders its sets in another way."""
+    subprocess.run([*COMMAND, *map(str, args)], cwd=cwd, check=True, capture_output=True)
 
 
 def copy_samples(folder: Path) -> Path:

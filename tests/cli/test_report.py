@@ -18,7 +18,13 @@ import pytest
 import rasterio
 
 from geodelreg.product.report import report_schema
-from tests.cli.helpers import COMMAND, Command, copy_samples, snapshot, write_noise
+from tests.cli.helpers import (
+    Command,
+    copy_samples,
+    run_fresh_command,
+    snapshot,
+    write_noise,
+)
 from tests.cli.pages import Page
 
 KINDS = ("before-after", "arrows", "mesh", "error", "matches")
@@ -109,19 +115,21 @@ def test_a_refusal_has_its_page_with_the_reasons_and_the_candidate(made: Path) -
     assert "squares 1, 2 and 3" not in page.text
 
 
-def test_the_command_on_the_page_finds_the_same_again(made: Path, tmp_path: Path) -> None:
+def test_the_command_on_the_page_finds_the_same_again(
+    geodelreg: Command, made: Path, tmp_path: Path
+) -> None:
     for name in ("ms.tif", "pan.tif"):
         shutil.copy(made / name, tmp_path)
     asked = ("--model", "shift", "--max-shift", "50", "-b", "3", "--report", "again.html")
-    command = [*COMMAND, "align", "ms.tif", "pan.tif", "--dry-run", *asked]
-    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    done = geodelreg("align", "ms.tif", "pan.tif", "--dry-run", *asked, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
     first = (tmp_path / "again.html").read_bytes()
     (tmp_path / "again.html").unlink()
     (tmp_path / "first.html").write_bytes(first)
     (told,) = Page(tmp_path / "first.html").texts["pre"]
     words = told.split()
     assert words[0] == "geodelreg"
-    subprocess.run([*COMMAND, *words[1:]], cwd=tmp_path, check=True, capture_output=True)
+    run_fresh_command(*words[1:], cwd=tmp_path)
     assert (tmp_path / "again.html").read_bytes() == first
 
 
@@ -157,14 +165,11 @@ def test_names_of_files_and_bands_are_shown_and_never_run(
 
 
 @pytest.mark.parametrize("name", ["good", "bad"])
-def test_a_page_made_later_is_the_same(
-    geodelreg: Command, made: Path, tmp_path: Path, name: str
-) -> None:
+def test_a_page_made_later_is_the_same(made: Path, tmp_path: Path, name: str) -> None:
     for path in made.iterdir():
         shutil.copy(path, tmp_path)
     pan = "pan.tif" if name == "good" else "noise.tif"
-    done = geodelreg("report", f"{name}.json", "ms.tif", pan, "-o", "later.html", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    run_fresh_command("report", f"{name}.json", "ms.tif", pan, "-o", "later.html", cwd=tmp_path)
     assert (tmp_path / "later.html").read_bytes() == (made / f"{name}.html").read_bytes()
 
 
@@ -226,18 +231,16 @@ def test_a_spoilt_report_is_refused_in_words(
 def test_each_kind_of_figure_is_drawn_the_same_twice(
     geodelreg: Command, made: Path, tmp_path: Path, kind: str
 ) -> None:
-    drawn: dict[str, set[bytes]] = {".png": set(), ".svg": set()}
-    for name in ("one", "two"):
-        for suffix, found in drawn.items():
-            path = tmp_path / f"{name}{suffix}"
-            done = geodelreg(
-                *("figure", "good.json", "ms.tif", "pan.tif", "--kind", kind, "-o", path), cwd=made
-            )
-            assert done.returncode == 0, done.stderr
-            found.add(path.read_bytes())
-    assert [len(found) for found in drawn.values()] == [1, 1]
-    assert drawn[".png"].pop().startswith(b"\x89PNG")
-    assert b"<svg" in drawn[".svg"].pop()
+    args = ("figure", "good.json", "ms.tif", "pan.tif", "--kind", kind, "-o")
+    for name in ("one.png", "two.png", "one.svg"):
+        done = geodelreg(*args, tmp_path / name, cwd=made)
+        assert done.returncode == 0, done.stderr
+    run_fresh_command(*args, tmp_path / "two.svg", cwd=made)
+    drawn = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert drawn["one.png"] == drawn["two.png"]
+    assert drawn["one.svg"] == drawn["two.svg"]
+    assert drawn["one.png"].startswith(b"\x89PNG")
+    assert b"<svg" in drawn["one.svg"]
 
 
 def test_a_refusal_has_its_figure(geodelreg: Command, made: Path, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import zipfile
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from geodelreg.door.names import LOCAL, NETWORK, needed_access
 from geodelreg.errors import AccessNotAllowedError, RasterUnreadableError
 from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Window
-from tests.cli.helpers import COMMAND
+from tests.cli.helpers import run_command
 from tests.integration.loopback import Server
 from tests.integration.raster_samples import make_tiff
 
@@ -229,8 +228,7 @@ def test_the_command_sends_no_request_and_says_what_allows_it(
     server.log.unlink(missing_ok=True)
     hidden = vrt(tmp_path, SOURCE.format(nested))
     for name in (f"{server.address}/ms.tif", str(hidden)):
-        command = [*COMMAND, "check", name, str(tmp_path / "pan.tif")]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        result = run_command("check", name, tmp_path / "pan.tif")
         assert "Traceback" not in result.stderr
         if "://" in name:
             assert "add --allow network" in result.stderr

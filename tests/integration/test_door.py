@@ -32,7 +32,7 @@ from geodelreg.options import WriteOptions
 from geodelreg.product.gcps import GcpContext, read_gcps
 from geodelreg.raster.reader import open_raster
 from geodelreg.values.raster import Grid, Window
-from tests.cli.helpers import COMMAND
+from tests.cli.helpers import run_command
 from tests.integration.faults import names
 from tests.integration.loopback import Server
 from tests.integration.raster_samples import GCPS, TAGS, correction_of, make_tiff
@@ -164,7 +164,7 @@ def test_the_command_opens_no_mrf_for_a_tiff(folder: Path, which: str) -> None:
     hostile, good = str(mrf(folder / "x.tif")), str(folder / "image.tif")
     names = {"MS": [hostile, good], "PAN": [good, hostile]}.get(which, [good, good])
     more = ["--mask", hostile] if which == "--mask" else []
-    done = subprocess.run([*COMMAND, "check", *names, *more], capture_output=True, text=True)
+    done = run_command("check", *names, *more)
     assert "format MRF" in done.stderr
     assert "--allow all" in done.stderr
     assert (folder.parent / "victim").read_bytes() == b"not yours"
