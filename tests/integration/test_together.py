@@ -349,13 +349,12 @@ def test_one_file_that_cannot_be_edited_keeps_the_others_as_they_are(
     assert names(folder) == set(before)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_error_at_every_call_leaves_all_headers_or_none(folder: Path, number: int) -> None:
+def test_error_at_every_call_leaves_all_headers_or_none(folder: Path) -> None:
     paths = bands(folder)
     result, before, step, failed = found_for(paths), contents(folder), 0, True
     while failed:
         step += 1
-        failed = run_with_error(lambda: geodelreg.write_in_place(result), step, number)
+        failed = run_with_error(lambda: geodelreg.write_in_place(result), step)
         moved = {transform_of(path) for path in paths}
         assert len(moved) == 1
         if moved == {TRANSFORM}:
@@ -393,7 +392,8 @@ def test_kill_within_every_call_is_settled_by_the_next_run_on_any_file(folder: P
 
 
 def test_kill_of_a_second_edit_takes_back_that_one_only(folder: Path) -> None:
-    paths = bands(folder)
+    paths = bands(folder)[:2]
+    (folder / BANDS[2]).unlink()
     geodelreg.write_in_place(found_for(paths))
     before = contents(folder)
     second = found_for(paths, TRANSFORM @ SHIFT @ SHIFT)
