@@ -35,7 +35,8 @@ from geodelreg.values.result import CheckOutcome
 
 SHAPE = (640, 640)
 SPEC = SceneSpec("bent", "", HeaderError((1.3, -0.7)), SHAPE, (300, 300), ratio=2.0)
-CLOUDY = replace(SPEC, name="cloudy 1", variant="clouds")
+SMALL = replace(SPEC, pan_shape=(400, 400), ms_shape=(190, 190))
+CLOUDY = replace(SMALL, name="cloudy 1", variant="clouds")
 
 
 def still(xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,7 +71,8 @@ def wavy(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture(scope="module")
 def torn(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return made(tmp_path_factory.mktemp("torn"), Tear((16.0, -12.0), 0.4, 0.0, SHAPE))
+    tear = Tear((16.0, -12.0), 0.4, 0.0, SMALL.pan_shape)
+    return made(tmp_path_factory.mktemp("torn"), tear, SMALL)
 
 
 def refusal(of: Made, **options: object) -> tuple[AlignmentRefusedError, Alignment]:
@@ -164,11 +166,14 @@ def test_a_second_motion_is_refused_and_its_place_is_told(torn: Made) -> None:
     error, alignment = refusal(torn, on_local="warn")
     assert failed(alignment) == {"two_motions"}
     assert "16 px left and 12 px down of the rest" in str(error)
-    assert "the lower 4" in str(error)
+    share = re.search(r"the lower (\d+) %", str(error))
+    assert share is not None
+    assert int(share[1]) == pytest.approx(40, abs=4)
     assert "`mask`" in error.remedy
 
 
-def test_check_calls_both_misaligned(wavy: Made, torn: Made) -> None:
+def test_check_calls_both_misaligned(torn: Made, tmp_path: Path) -> None:
+    wavy = made(tmp_path, waves(2.0, 300.0, np.random.default_rng(0)), SMALL)
     for of in (wavy, torn):
         found = geodelreg.check(of.ms, of.pan)
         assert found.outcome is CheckOutcome.MISALIGNED
@@ -220,7 +225,7 @@ def test_ground_between_clouds_is_aligned_and_their_share_told(tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", ["shaded like relief", "the edges of PAN"])
 def test_slopes_of_an_image_are_aligned_with_its_slopes(kind: str, tmp_path: Path) -> None:
-    scene = make_scene(SPEC, sample_imagery())
+    scene = make_scene(SMALL, sample_imagery())
     shaded = relief_shading(scene.ms, np.random.default_rng(3))
     ms = gradient_contrast(scene.ms) if "edges" in kind else shaded
     pair = written(tmp_path, BentPair(replace(scene, ms=ms)))
@@ -230,7 +235,7 @@ def test_slopes_of_an_image_are_aligned_with_its_slopes(kind: str, tmp_path: Pat
 
 
 def test_an_image_that_is_half_shaded_has_two_places_and_is_refused(tmp_path: Path) -> None:
-    scene = make_scene(SPEC, sample_imagery())
+    scene = make_scene(SMALL, sample_imagery())
     shaded = relief_shading(scene.ms, np.random.default_rng(3)).astype(np.float64)
     plain = scene.ms * (shaded.std() / scene.ms.std())
     half = BentPair(replace(scene, ms=np.rint(shaded + plain).astype(np.uint16)))
@@ -241,7 +246,7 @@ def test_an_image_that_is_half_shaded_has_two_places_and_is_refused(tmp_path: Pa
 def test_a_shaded_image_is_refused_though_clipped_clouds_hold_most_of_its_contrast(
     tmp_path: Path,
 ) -> None:
-    scene = make_scene(SPEC, sample_imagery())
+    scene = make_scene(SMALL, sample_imagery())
     # the brightest fields saturate both sensors, as clouds do; the rest is dim
     clipped = [
         np.where(image > np.percentile(image, 96), 4095, 300 + image // 20).astype(np.uint16)
@@ -253,7 +258,7 @@ def test_a_shaded_image_is_refused_though_clipped_clouds_hold_most_of_its_contra
 
 
 def drawn_on(
-    folder: Path, kind: str, same_ground: bool, spec: SceneSpec = SPEC, seed: int = 2
+    folder: Path, kind: str, same_ground: bool, spec: SceneSpec = SMALL, seed: int = 2
 ) -> Made:
     """A pair, or a scene and its mirror image, with the same structure on the grid of both."""
     imagery, spec = sample_imagery(), replace(spec, error=HeaderError((6.0, -4.0)))
@@ -334,11 +339,11 @@ def test_a_scale_is_found_from_a_corner_that_shows_something(tmp_path: Path) -> 
     assert alignment.accuracy.coverage < 0.2
 
 
-@pytest.mark.parametrize("shift", [(-6.0, -2.4), (-1.6, -0.9)])
+@pytest.mark.parametrize(("shift", "spec"), [((-6.0, -2.4), SPEC), ((-1.6, -0.9), SMALL)])
 def test_bands_that_lie_apart_are_refused_and_named_however_far(
-    shift: tuple[float, float], tmp_path: Path
+    shift: tuple[float, float], spec: SceneSpec, tmp_path: Path
 ) -> None:
-    apart = bands_apart(tmp_path, shift)
+    apart = bands_apart(tmp_path, shift, spec)
     error, alignment = refusal(apart)
     assert "bands" in failed(alignment)
     told = re.search(r"band 3 lies ([\d.]+) px right and ([\d.]+) px down of band", str(error))
@@ -358,7 +363,7 @@ def test_bands_that_lie_a_little_apart_are_warned_of(tmp_path: Path) -> None:
 
 def test_bands_that_lie_apart_two_by_two_are_refused(tmp_path: Path) -> None:
     still, shift = (0.0, 0.0), (3.0, -4.0)
-    scene = make_scene(SPEC, sample_imagery(), band_shifts=(still, still, shift, shift))
+    scene = make_scene(SMALL, sample_imagery(), band_shifts=(still, still, shift, shift))
     error, alignment = refusal(written(tmp_path, BentPair(scene)))
     assert "bands" in failed(alignment)
     told = re.search(r"([\d.]+) px left and ([\d.]+) px down of band", str(error))
@@ -380,9 +385,9 @@ def test_a_band_that_looks_unlike_the_others_is_not_called_misaligned(
     assert not any("bands do not agree" in warning for warning in alignment.warnings)
 
 
-def bands_apart(folder: Path, shift: tuple[float, float]) -> Made:
+def bands_apart(folder: Path, shift: tuple[float, float], spec: SceneSpec = SMALL) -> Made:
     still = (0.0, 0.0)
-    scene = make_scene(SPEC, sample_imagery(), band_shifts=(still, still, shift, still))
+    scene = make_scene(spec, sample_imagery(), band_shifts=(still, still, shift, still))
     return written(folder, BentPair(scene))
 
 
