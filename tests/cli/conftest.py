@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.helpers import Command, copy_samples, run_command
+from tests.cli.helpers import Command, copy_corner, copy_samples, run_command
 
 
 @pytest.fixture(scope="session")
@@ -17,5 +17,11 @@ def geodelreg() -> Command:
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Path:
+    """Folder with ms.tif and pan.tif: a corner of the sample pair."""
+    return copy_corner(tmp_path)
+
+
+@pytest.fixture
+def whole_pair(tmp_path: Path) -> Path:
     """Folder with ms.tif and pan.tif: the sample pair, whose header error is known."""
     return copy_samples(tmp_path)

@@ -15,11 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio.windows import Window
 
 from tests.cli import forked
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = ROOT / "sample_tiles"
+SIDE = {"ms.tif": 100, "pan.tif": 400}
+"""Pixels across the corner of the sample pair, which is aligned in half the time of the whole."""
 
 COMMAND = (sys.executable, "-m", "geodelreg_cli")
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -64,6 +67,17 @@ def run_fresh_command(*args: object, cwd: Path) -> None:
 def copy_samples(folder: Path) -> Path:
     for name in ("ms.tif", "pan.tif"):
         shutil.copy(SAMPLES / name, folder / name)
+    return folder
+
+
+def copy_corner(folder: Path) -> Path:
+    """The upper left corner of either sample."""
+    for name, side in SIDE.items():
+        with rasterio.open(SAMPLES / name) as dataset:
+            bands = dataset.read(window=Window(0, 0, side, side))
+            profile = dataset.profile | {"height": side, "width": side}
+        with rasterio.open(folder / name, "w", **profile) as dataset:
+            dataset.write(bands)
     return folder
 
 

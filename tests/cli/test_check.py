@@ -120,8 +120,8 @@ def test_an_unrelated_pair_is_exit_3_with_the_reason(
         assert done.stdout == "ms.tif: cannot tell (tolerance 0.5 PAN px)\n"
 
 
-def test_json_is_the_report_with_a_block_of_its_own(geodelreg: Command, pair: Path) -> None:
-    done = geodelreg("check", "ms.tif", "pan.tif", "--json", "--model", "scale", cwd=pair)
+def test_json_is_the_report_with_a_block_of_its_own(geodelreg: Command, whole_pair: Path) -> None:
+    done = geodelreg("check", "ms.tif", "pan.tif", "--json", "--model", "scale", cwd=whole_pair)
     assert done.returncode == 4
     report = json.loads(done.stdout)
     jsonschema.validate(report, report_schema())
@@ -135,12 +135,14 @@ def test_json_is_the_report_with_a_block_of_its_own(geodelreg: Command, pair: Pa
     assert report["correction"]["at_centre"]["shift_px"] == pytest.approx([7.36, -4.62], abs=0.05)
 
 
-def test_one_file_per_band(geodelreg: Command, pair: Path) -> None:
-    with rasterio.open(pair / "ms.tif") as ms:
+def test_one_file_per_band(geodelreg: Command, whole_pair: Path) -> None:
+    with rasterio.open(whole_pair / "ms.tif") as ms:
         for number in ms.indexes:
-            with rasterio.open(pair / f"B{number}.tif", "w", **ms.profile | {"count": 1}) as band:
+            with rasterio.open(
+                whole_pair / f"B{number}.tif", "w", **ms.profile | {"count": 1}
+            ) as band:
                 band.write(ms.read(number), 1)
-    done = geodelreg("check", "B1.tif", "B2.tif", "B3.tif", "B4.tif", "pan.tif", cwd=pair)
+    done = geodelreg("check", "B1.tif", "B2.tif", "B3.tif", "B4.tif", "pan.tif", cwd=whole_pair)
     assert done.returncode == 4, done.stderr
     assert done.stdout.startswith("B1.tif and 3 more: misaligned by up to 9.")
 

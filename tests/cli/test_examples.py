@@ -21,10 +21,7 @@ from benchmarks.batch.pairs import write_pairs
 from geodelreg.batch.cells import FILES, NEVER, SIDE_FILES
 from tests.cli.batch_helpers import outcomes
 from tests.cli.examples import ROOT, examples, pages, run_examples
-from tests.cli.helpers import SAMPLES
-
-SIDE = {"ms.tif": 100, "pan.tif": 400}
-"""Pixels across the corner of the sample pair that most examples are run on."""
+from tests.cli.helpers import SAMPLES, SIDE, copy_corner, copy_samples
 
 
 def pixels(name: str, side: int | None = None) -> NDArray[Any]:
@@ -46,16 +43,9 @@ def write_as(path: Path, model: str, data: NDArray[Any], **profile: Any) -> None
         dataset.write(data)
 
 
-def corner(folder: Path) -> None:
-    """ms.tif and pan.tif: a corner of the sample pair."""
-    for name, side in SIDE.items():
-        write_as(folder / name, name, pixels(name, side))
-
-
 def whole(folder: Path) -> None:
     """ms.tif and pan.tif: the sample pair."""
-    for name in SIDE:
-        shutil.copy(SAMPLES / name, folder / name)
+    copy_samples(folder)
 
 
 def free_port() -> int:
@@ -143,7 +133,7 @@ def frame_is_no_data(folder: Path) -> None:
 
 
 def clouds(folder: Path) -> None:
-    corner(folder)
+    copy_corner(folder)
     clear = np.full((1, 100, 100), 21824, dtype=np.uint16)
     qa = "LC08_L2SP_016035_20210608_20210615_02_T1_QA_PIXEL.TIF"
     write_as(folder / qa, "ms.tif", clear)
@@ -156,21 +146,21 @@ def clouds(folder: Path) -> None:
 
 
 def band_files(folder: Path) -> None:
-    corner(folder)
+    copy_corner(folder)
     for name, band in zip(("B2", "B3", "B4", "B8A"), pixels("ms.tif", 100), strict=True):
         write_as(folder / f"{name}.tif", "ms.tif", band[None])
     (folder / "pan.tif").rename(folder / "B8.tif")
 
 
 def scene_of_several_files(folder: Path) -> None:
-    corner(folder)
+    copy_corner(folder)
     masks(folder, ["mask.tif"], 1, 0)
     write_as(folder / "B05.tif", "ms.tif", pixels("ms.tif", 50))
     write_lakes(folder / "fields.geojson")
 
 
 def python_files(folder: Path) -> None:
-    corner(folder)
+    copy_corner(folder)
     masks(folder, ["clouds.tif"], 1, 0)
     masks(folder, ["SCL.jp2"], 9, 4)
     write_lakes(folder / "lakes.geojson")
@@ -217,15 +207,15 @@ def nothing(folder: Path) -> None:
 PAGES: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "docs/api.md": (python_files, output_is_aligned),
     "docs/batch.md": (many_pairs, pairs_are_aligned),
-    "docs/start.md": (corner, output_is_aligned),
+    "docs/start.md": (copy_corner, output_is_aligned),
     "docs/how-to/apply.md": (scene_of_several_files, nothing),
     "docs/how-to/band-files.md": (band_files, bands_are_aligned),
-    "docs/how-to/bent.md": (corner, spline_is_aligned),
+    "docs/how-to/bent.md": (copy_corner, spline_is_aligned),
     "docs/how-to/check.md": (whole, nothing),
     "docs/how-to/clouds.md": (clouds, nothing),
-    "docs/how-to/in-place.md": (corner, header_is_back),
+    "docs/how-to/in-place.md": (copy_corner, header_is_back),
     "docs/how-to/no-data.md": (framed, frame_is_no_data),
-    "docs/how-to/xarray.md": (corner, output_is_aligned),
+    "docs/how-to/xarray.md": (copy_corner, output_is_aligned),
     "docs/tutorials/landsat.md": (landsat, landsat_is_sharp),
     "docs/tutorials/sentinel-2.md": (sentinel2, sentinel2_is_sharp),
     "docs/tutorials/vhr.md": (worldview, keeps_eleven_bits),
@@ -235,7 +225,7 @@ SCRIPT = "docs/how-to/scripts.md"
 
 @pytest.mark.parametrize("page", [page for page in pages() if examples(page) and page != SCRIPT])
 def test_examples_run(page: str, tmp_path: Path) -> None:
-    prepare, look = PAGES.get(page, (corner, nothing))
+    prepare, look = PAGES.get(page, (copy_corner, nothing))
     prepare(tmp_path)
     run_examples(page, tmp_path, free_port())
     look(tmp_path)
@@ -243,7 +233,7 @@ def test_examples_run(page: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("blank", "outcome"), [(False, "aligned"), (True, "not aligned")])
 def test_script_tells_a_refusal(tmp_path: Path, blank: bool, outcome: str) -> None:
-    corner(tmp_path)
+    copy_corner(tmp_path)
     if blank:
         noise = np.random.default_rng(1).integers(1, 4000, (4, 100, 100)).astype(np.uint16)
         write_as(tmp_path / "ms.tif", "ms.tif", noise)
@@ -257,7 +247,7 @@ def test_gdals_own_tools_sharpen_the_same(tmp_path: Path) -> None:
     if shutil.which("gdalwarp") is None or shutil.which("gdal_pansharpen.py") is None:
         pytest.skip("GDAL's programs are not installed")
     page = "docs/tutorials/pansharpening.md"
-    corner(tmp_path)
+    copy_corner(tmp_path)
     (recipe,) = examples(page, "bash")
     assert "gdalwarp" in recipe[1]
     run_examples(page, tmp_path, free_port(), "bash")

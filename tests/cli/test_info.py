@@ -34,7 +34,7 @@ def test_info_says_what_rasterio_says(geodelreg: Command, pair: Path) -> None:
 def test_info_of_a_corrected_raster_tells_where_it_is_from(geodelreg: Command, pair: Path) -> None:
     assert geodelreg("align", "ms.tif", "pan.tif", "-o", "out.tif", cwd=pair).returncode == 0
     done = geodelreg("info", "out.tif", cwd=pair)
-    assert "out.tif: GTiff, 200 × 200 pixels, 4 bands" in done.stdout
+    assert "out.tif: GTiff, 100 × 100 pixels, 4 bands" in done.stdout
     assert "CRS: WGS 84 / UTM zone 18N (EPSG:32618)" in done.stdout
     assert "verdict: aligned" in done.stdout
     assert "pan: pan.tif" in done.stdout

@@ -20,7 +20,7 @@ import rasterio
 from geodelreg.product.report import report_schema
 from tests.cli.helpers import (
     Command,
-    copy_samples,
+    copy_corner,
     run_fresh_command,
     snapshot,
     write_noise,
@@ -32,8 +32,8 @@ KINDS = ("before-after", "arrows", "mesh", "error", "matches")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, geodelreg: Command) -> Path:
-    """The sample pair with its page and its JSON, and a refused one's; never written to."""
-    folder = copy_samples(tmp_path_factory.mktemp("made"))
+    """A pair with its page and its JSON, and a refused one's; never written to."""
+    folder = copy_corner(tmp_path_factory.mktemp("made"))
     write_noise(folder / "noise.tif", like=folder / "pan.tif", seed=1)
     for pan, name, code in (("pan.tif", "good", 0), ("noise.tif", "bad", 3)):
         reports = ("--report", f"{name}.html", "--report", f"{name}.json")
@@ -139,7 +139,7 @@ def test_the_command_on_the_page_finds_the_same_again(
 def test_names_of_files_and_bands_are_shown_and_never_run(
     geodelreg: Command, tmp_path: Path
 ) -> None:
-    copy_samples(tmp_path)
+    copy_corner(tmp_path)
     ms = "a\"><img src=x onerror=alert(1)>'&amp;.tif"
     shutil.copy(tmp_path / "ms.tif", tmp_path / ms)
     band = "</title><script>alert(2)</script>\u202eevil\u2066"
