@@ -299,7 +299,8 @@ def _written(alignment: Alignment, request: Request) -> str:
     names = ", ".join(str(path) for path in paths if path is not None and str(path) != "-")
     if request.in_place and alignment.verdict.outcome is Outcome.ALIGNED:
         names = f"the header of MS{', ' if names else ''}{names}"
-    return f"Written: {names or 'nothing'}{' (dry run)' if request.dry_run and not names else ''}"
+    dry = request.output is None and not request.in_place
+    return f"Written: {names or ('nothing (dry run)' if dry else 'nothing')}"
 
 
 def _step_counts(alignment: Alignment) -> str:
