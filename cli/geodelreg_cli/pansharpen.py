@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from geodelreg.errors import shown
 from geodelreg.flags import as_typed
 from geodelreg.options import AlignOptions
 from geodelreg.sharpen_options import PansharpenOptions
@@ -91,6 +92,7 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
     from geodelreg.pair import part_of
     from geodelreg.product.pansharpen import sharpened_driver
     from geodelreg.sharpen import check_sharpenable
+    from geodelreg.values.remedies import ROTATES
     from geodelreg_cli.outputs import check_targets
 
     if given["no_align"] and not align_options.pan_band:
@@ -118,6 +120,8 @@ def pansharpen(rasters: tuple[str, ...], **given: Any) -> None:
             progress=part_of(step, parts - 1, parts),
         )
     if alignment is not None:
-        warn(alignment.warnings)
+        warn(text for text in alignment.warnings if text != ROTATES)  # OUT has the grid of PAN
         if not given["quiet"]:
-            click.echo(as_typed(alignment.summary()), err=True)
+            *found, _ = alignment.summary().splitlines()  # what to do next is done
+            click.echo(as_typed("\n".join(found)), err=True)
+            click.echo(shown(f"Written: {given['output']}"), err=True)

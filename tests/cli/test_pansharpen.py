@@ -17,6 +17,9 @@ def test_aligned_first_or_taken_as_it_is(geodelreg: Command, pair: Path) -> None
     for args in (("sharp.tif",), ("raw.tif", "--no-align")):
         done = geodelreg(*PANSHARPEN, *args, cwd=pair)
         assert (done.returncode, done.stdout) == (0, "")
+        said = done.stderr.splitlines()
+        assert not [line for line in said if line.startswith("Next")]  # it is sharpened
+        assert said[-1:] == ([f"Written: {args[0]}"] if len(args) == 1 else [])
     assert geodelreg("align", "ms.tif", "pan.tif", "-o", "al.tif", cwd=pair).returncode == 0
     done = geodelreg("pansharpen", "al.tif", "pan.tif", "-o", "two.tif", "--no-align", cwd=pair)
     assert done.returncode == 0
