@@ -120,7 +120,8 @@ FAILED = {
     "coverage": "The places that agree lie together in a small part of the overlap.",
     "sigma_px": "The correction is too uncertain at the far corner.",
     "disagreement_px": "Two halves of the tie points tell different corrections.",
-    "rival": "The images fit nearly as well at another place, as over a repeating pattern.",
+    "rival": "The images fit nearly as well at another place, as over clouds or a "
+    "repeating pattern.",
     "shading": "Light falls differently on the two images: one is shaded like relief.",
     "repeated": "Labels, collars or the like on both images fit, and the ground does not.",
     "rival_motion": "Nearly as many patches agree on another motion as on the one followed: a part "

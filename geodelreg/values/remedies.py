@@ -69,9 +69,9 @@ _REMEDIES = (
     (
         {"rival", "shading"},
         (
-            "The images fit elsewhere nearly as well: repeated texture, or one of them is shaded "
-            "like relief. Try `band` with the band that looks most like PAN, or a larger part of "
-            "the scene."
+            "The images fit elsewhere nearly as well: clouds that outweigh the ground (mask them, "
+            "`mask`), repeated texture, or one of them is shaded like relief. Try `band` with the "
+            "band that looks most like PAN, or a larger part of the scene."
         ),
     ),
     (

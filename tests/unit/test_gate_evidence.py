@@ -28,6 +28,7 @@ from geodelreg.geo.maps.affine import IDENTITY, AffineMap
 from geodelreg.judge.bands import bands_apart
 from geodelreg.judge.in_place import AreaEvidence, area_evidence, best_in_place
 from geodelreg.judge.rival import rival_correlation
+from geodelreg.judge.words import followed_part
 from geodelreg.options import AlignOptions
 from geodelreg.pair import make_pair, roles
 from geodelreg.values.points import Guess, Overview, Status, TiePoints
@@ -329,3 +330,4 @@ def test_stronger_keypoints_are_heeded_after_a_refusal(
     apart, move_px = keypoints_apart(pair, own, [before], IDENTITY, points)
     assert (apart <= MAX_KEYPOINTS_APART) is passes
     assert np.hypot(*move_px) == pytest.approx(apart)
+    assert (f"lies {apart:.2g} px right" in followed_part(points, pair, move_px)) is (apart > 0)
