@@ -187,11 +187,12 @@ def check_order(source: WindowReader, reference: WindowReader, options: AlignOpt
     except CrsTransformError:
         return  # told better when the two are related
     if other >= _SWAPPED_RATIO * mine:
+        right = f": {reference.name} {source.name}" if reference.name != source.name else ""
         raise UsageError(
             f"{source.name} has one band of {mine:.4g} m pixels, and {reference.name} {theirs} of "
             f"{other:.4g} m: MS and PAN are swapped",
-            f"MS, which is corrected, comes first: {reference.name} {source.name}. If "
-            f"{source.name} is the one to be corrected, name its band: `band=1`.",
+            f"MS, which is corrected, comes first{right}. If the raster of one band is to be "
+            "corrected, say so: `band=1`.",
         )
 
 
