@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, cast
 
 from geodelreg.door.files import check_regular
 from geodelreg.door.names import ALL, NETWORK, check_name, in_zip, is_local, needed_access, refuse
-from geodelreg.errors import RasterUnreadableError
+from geodelreg.errors import MissingExtraError, RasterUnreadableError
 
 if TYPE_CHECKING:
     from zipfile import Path as ZipPath
@@ -52,6 +53,29 @@ GEOJSON, GEOJSON_LINES = {".geojson", ".json"}, {".geojsonl", ".geojsons"}
 def is_vector(name: str) -> bool:
     """Whether a file's name is that of a vector file."""
     return PurePath(name).suffix.lower() in GEOJSON | GEOJSON_LINES | EXTENSIONS
+
+
+def ogr(what: str, instead: str = ".") -> ModuleType:
+    """``pyogrio``, with its ``raw``.
+
+    Parameters
+    ----------
+    what : str
+        Needs it, for the message.
+    instead : str
+        What else could be done, to end the remedy.
+
+    Raises
+    ------
+    MissingExtraError
+    """
+    try:
+        import pyogrio
+        import pyogrio.raw
+    except ImportError as error:
+        remedy = "Install it: pip install pyogrio (in a clone: pip install '.[vector]')"
+        raise MissingExtraError(what, remedy + instead) from error
+    return cast("ModuleType", pyogrio)
 
 
 def check_vector(name: str, allow: str) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from geodelreg.door.vectors import GEOJSON, check_vector
-from geodelreg.errors import MissingExtraError, RasterUnreadableError, VectorUnreadableError
+from geodelreg.door.vectors import GEOJSON, check_vector, ogr
+from geodelreg.errors import RasterUnreadableError, VectorUnreadableError
 from geodelreg.geotiff.atomic import staged, write_text_atomically
 from geodelreg.product.stored import StoredCorrection
 from geodelreg.values.raster import FloatArray
@@ -152,15 +152,7 @@ def _csv(stored: StoredCorrection, name: str, text: str, force: bool) -> str:
 def _write_geopackage(
     stored: StoredCorrection, source: Path, target: Path, overwrite: bool, force: bool
 ) -> None:
-    try:
-        import pyogrio
-        from pyogrio.raw import read, write
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{source} needs pyogrio to be read",
-            "Install it: pip install pyogrio (in a clone: pip install '.[vector]'); or convert the "
-            "file to GeoJSON.",
-        ) from error
+    pyogrio = ogr(f"{source} needs pyogrio to be read", "; or convert the file to GeoJSON.")
     from shapely import from_wkb, get_coordinates, set_coordinates, to_wkb
 
     try:
@@ -168,11 +160,11 @@ def _write_geopackage(
         layers = [str(layer) for layer, _ in pyogrio.list_layers(source)]
         with staged(target, overwrite=overwrite) as out:
             for layer in layers:
-                about, _, binary, columns = read(source, layer=layer)
+                about, _, binary, columns = pyogrio.raw.read(source, layer=layer)
                 shapes = from_wkb(binary)
                 xy = get_coordinates(shapes)
                 moved = _mover(stored, str(source), xy, str(about["crs"]), force)
-                write(
+                pyogrio.raw.write(
                     out,
                     to_wkb(set_coordinates(shapes.copy(), moved)),
                     columns,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.door.names import LOCAL, gdal_name, is_local, needed_access
-from geodelreg.door.vectors import EXTENSIONS, GEOJSON, GEOJSON_LINES, check_vector
-from geodelreg.errors import GeodelregError, MaskError, MissingExtraError, RasterUnreadableError
+from geodelreg.door.vectors import EXTENSIONS, GEOJSON, GEOJSON_LINES, check_vector, ogr
+from geodelreg.errors import GeodelregError, MaskError, RasterUnreadableError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
 from geodelreg.masking import AUTO, VECTOR, MaskSpec
@@ -151,17 +151,9 @@ def _legacy_crs(document: dict[str, Any]) -> str:
 
 
 def _read_with_pyogrio(path: str, allow: str) -> tuple[Geometries, str]:
-    try:
-        import pyogrio
-        from pyogrio.raw import read
-    except ImportError as error:
-        raise MissingExtraError(
-            f"the mask {path} needs pyogrio to be read",
-            "Install it: pip install pyogrio (in a clone: pip install '.[vector]'); or convert the "
-            "mask to GeoJSON.",
-        ) from error
     from shapely import from_wkb
 
+    pyogrio = ogr(f"the mask {path} needs pyogrio to be read", "; or convert the mask to GeoJSON.")
     suffix = PurePath(path).suffix.lower()
     try:
         if suffix in EXTENSIONS:
@@ -176,7 +168,7 @@ def _read_with_pyogrio(path: str, allow: str) -> tuple[Geometries, str]:
                 + (f" ({', '.join(layers)})" if layers else ""),
                 "A mask has one: ogr2ogr -nln mask one.gpkg FILE LAYER.",
             )
-        about, _, binary, _ = read(opened, layer=layers[0], columns=[], force_2d=True)
+        about, _, binary, _ = pyogrio.raw.read(opened, layer=layers[0], columns=[], force_2d=True)
         found = from_wkb(binary)
     except (RuntimeError, ValueError, OSError, RasterUnreadableError) as error:
         reason = " ".join(str(error).split())

@@ -7,21 +7,21 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geodelreg.door.names import LOCAL
-from geodelreg.door.vectors import check_vector
-from geodelreg.errors import GcpFormatError, MissingExtraError, RasterUnreadableError
+from geodelreg.door.vectors import check_vector, ogr
+from geodelreg.errors import GcpFormatError, RasterUnreadableError
 from geodelreg.product.gcps.context import Decoded, GcpContext, crs_name, ground_of
 from geodelreg.product.gcps.facts import ENABLE, FIT, STATUS
 from geodelreg.product.gcps.features import fields_of_gcp, gcps_of
 from geodelreg.values.points import Gcp
 
 _LAYER = "points"
+_INSTEAD = ". GeoJSON needs nothing."
 _TEXTS, _WHOLE = ("id", "info", "crs", FIT), (ENABLE, STATUS)
 _ROUNDING = 1e-9  # of a coordinate: millimetres, which changes of CRS there and back stay below
 _DATE = {"OGR_CURRENT_DATE": "1970-01-01T00:00:00Z"}  # the same points are the same bytes
@@ -52,7 +52,7 @@ def _encoded(
 ) -> bytes:
     from shapely import points, to_wkb
 
-    pyogrio, raw = _pyogrio(path)
+    pyogrio = ogr(f"{path} needs pyogrio", _INSTEAD)
     crs = crs_name(context.source.crs_wkt)
     rows = [fields_of_gcp(gcp) | {"crs": crs} for gcp in gcps]
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -62,7 +62,7 @@ def _encoded(
     out = io.BytesIO()
     pyogrio.set_gdal_config_options(_DATE)
     try:
-        raw.write(
+        pyogrio.raw.write(
             out, to_wkb(points(ground_of(gcps))), columns, names, crs=context.source.crs_wkt,
             geometry_type="Point", driver=driver, layer=_LAYER, **options,
         )  # fmt: skip
@@ -84,7 +84,7 @@ def decode(path: Path, context: GcpContext | None) -> Decoded:
     """
     from shapely import from_wkb, get_coordinates, get_num_coordinates
 
-    pyogrio, raw = _pyogrio(path)
+    pyogrio = ogr(f"{path} needs pyogrio", _INSTEAD)
     try:
         check_vector(str(path), LOCAL)
         layers = [str(name) for name, _ in pyogrio.list_layers(path)]
@@ -92,7 +92,7 @@ def decode(path: Path, context: GcpContext | None) -> Decoded:
             raise GcpFormatError(f"it has no layer {_LAYER!r} but {', '.join(layers) or 'none'}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of columns that GDAL cannot keep
-            about, _, binary, columns = raw.read(
+            about, _, binary, columns = pyogrio.raw.read(
                 path, layer=_LAYER if _LAYER in layers else layers[0]
             )
     except (RuntimeError, ValueError, OSError, RasterUnreadableError) as error:
@@ -123,16 +123,3 @@ def _wkt(crs: str) -> str:
     from rasterio.crs import CRS
 
     return str(CRS.from_user_input(crs).to_wkt())
-
-
-def _pyogrio(path: Path) -> tuple[ModuleType, ModuleType]:
-    try:
-        import pyogrio
-        import pyogrio.raw
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path} needs pyogrio",
-            "Install it: pip install pyogrio (in a clone: pip install '.[vector]'). GeoJSON "
-            "needs nothing.",
-        ) from error
-    return pyogrio, pyogrio.raw
