@@ -86,7 +86,7 @@ class Alignment(result.Alignment):
         accuracy = self.accuracy
         return (
             f"<Alignment {self.verdict.outcome.value}: model {self.correction.model}, shift_px "
-            f"({short_signed(right)}, {short_signed(down)}), uncertainty_px "
+            f"({short(right)}, {short(down)}), uncertainty_px "
             f"{short(accuracy.uncertainty_px)}, {accuracy.kept} tie points>"
         )
 
@@ -210,11 +210,6 @@ class Alignment(result.Alignment):
             matplotlib is not installed.
         """
         return draw_tie_points(self, axes)
-
-
-def short_signed(value: float) -> str:
-    """As `short`, with the sign of what is negative."""
-    return ("-" if value < 0 else "") + short(abs(value))
 
 
 def _same_crs(one: str, other: str) -> bool:

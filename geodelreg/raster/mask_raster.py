@@ -61,6 +61,8 @@ class RasterMask:
     kind : str
         ``binary``, ``values``, ``landsat-qa`` or ``sentinel2-scl``.
     band : int
+    hide : ranges of values
+        For ``values``.
     covered_share : float
         Share of the image that lies on the mask, 0 to 1.
 
@@ -74,7 +76,7 @@ class RasterMask:
         self, spec: MaskSpec, image: Grid, opened: Opened, band: int | None = None
     ) -> None:
         self.path, self._dataset = spec.path, opened.dataset
-        self._hide = spec.hide
+        self.hide = spec.hide
         self._lock = threading.Lock()  # several threads read the image, and the mask has one handle
         self.band = band or _only_band(spec.path, self._dataset)
         self.kind = self._kind_of(spec.kind)
@@ -118,7 +120,7 @@ class RasterMask:
         if min(width, height) < 1:
             return np.zeros(grid.shape, dtype=np.bool_)
         stored = self._stored(Window(x, y, width, height))
-        there = hidden_values(stored, self.kind, self._hide, self._nodata)
+        there = hidden_values(stored, self.kind, self.hide, self._nodata)
         if not there.any():
             return np.zeros(grid.shape, dtype=np.bool_)
         (left, right), (top, bottom) = columns, rows

@@ -14,7 +14,7 @@ from geodelreg.door.vectors import EXTENSIONS, GEOJSON, GEOJSON_LINES, check_vec
 from geodelreg.errors import GeodelregError, MaskError, RasterUnreadableError
 from geodelreg.geo.affine import apply_affine
 from geodelreg.geo.crs import map_points
-from geodelreg.masking import AUTO, VECTOR, MaskSpec
+from geodelreg.masking import AUTO, VECTOR, MaskSpec, Ranges
 from geodelreg.values.raster import BoolArray, FloatArray, Grid
 
 Geometries = NDArray[np.object_]
@@ -43,6 +43,8 @@ class VectorMask:
     kind : str
         ``vector``.
     band : None
+    hide : tuple
+        Empty.
     covered_share : float
         Always 1: no geometry is an answer, too.
     is_elsewhere : bool
@@ -59,6 +61,7 @@ class VectorMask:
     """
 
     kind, band, covered_share = VECTOR, None, 1.0
+    hide: Ranges = ()
 
     def __init__(self, spec: MaskSpec, image: Grid, allow: str = LOCAL) -> None:
         from shapely import STRtree

@@ -12,7 +12,7 @@ import numpy as np
 from geodelreg.door.names import LOCAL, check_name
 from geodelreg.door.vectors import is_vector
 from geodelreg.errors import AccessNotAllowedError, GeodelregError, MaskError
-from geodelreg.masking import MASK_KINDS, MaskSpec, MaskUse, Ranges, parse_mask
+from geodelreg.masking import MASK_KINDS, MaskSpec, MaskUse, parse_mask
 from geodelreg.raster.inputs import AnyMask, Opened, mask_opened, opened
 from geodelreg.raster.mask_raster import RasterMask
 from geodelreg.raster.mask_vector import VectorMask
@@ -57,11 +57,9 @@ class Masks:
     ) -> None:
         self._image_name = image_name
         self._masks: list[RasterMask | VectorMask] = []
-        self._hide: list[Ranges] = []
         for raster, number, kind in bands:
             again = replace(raster, dataset=raster.again(stack)) if raster.is_file else raster
             self._masks.append(RasterMask(MaskSpec(raster.name, kind), image, again, number))
-            self._hide.append(())
         for name in names:
             spec = parse_mask(name) if isinstance(name, str) else None
             if spec is None:
@@ -73,7 +71,6 @@ class Masks:
                 self._masks.append(VectorMask(spec, image, allow))
             else:
                 self._masks.append(RasterMask(spec, image, _opened(spec.path, stack, allow)))
-            self._hide.append(spec.hide)
         self._hidden = np.zeros(len(self._masks) + 1, dtype=np.int64)
         self._seen = 0
         self._counts = True
@@ -110,10 +107,10 @@ class Masks:
         """What was used and how much it hides, for the report; `image` as in `MaskUse`."""
         return tuple(
             MaskUse(
-                image, mask.path, mask.band, mask.kind, hide,
+                image, mask.path, mask.band, mask.kind, mask.hide,
                 float(count / self._seen) if self._seen else float("nan"), mask.covered_share,
             )
-            for mask, hide, count in zip(self._masks, self._hide, self._hidden, strict=False)
+            for mask, count in zip(self._masks, self._hidden, strict=False)
         )  # fmt: skip
 
     def warnings(self) -> tuple[str, ...]:
