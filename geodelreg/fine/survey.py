@@ -101,13 +101,14 @@ def survey(overlay: Overlay, grid: tuple[str, str] = ("centred", "centred")) -> 
         row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
         move[number] = column + beyond(scores[row], column), row + beyond(scores[:, column], row)
         score[number], here[number] = scores[row, column], scores[reach, reach]
+    flat = patches.reshape(len(corners), size**2)
     return Places(
         np.reshape(corners, (-1, 2)) + size / 2,
         move - reach,
         score,
         here,
         show_texture(patches, noise_of(template, overlay.template_valid)),
-        np.percentile(patches, _BRIGHTEST_PERCENT, axis=(1, 2)).astype(np.float64),
+        np.percentile(flat, _BRIGHTEST_PERCENT, axis=1).astype(np.float64),
         size,
     )
 

@@ -49,3 +49,10 @@ def test_what_is_invalid_is_not_asked() -> None:
     found = survey(Overlay(image, image, valid, np.ones_like(valid)))
     assert len(found.centre)
     assert (found.centre[:, 1] > 90).all()
+
+
+def test_of_images_that_show_nothing_together_no_patch_is_placed() -> None:
+    image, hidden = texture((200, 240), 2), np.zeros((200, 240), dtype=bool)
+    found = survey(Overlay(image, image, hidden, hidden))
+    assert len(found.centre) == len(found.move) == len(found.brightest) == 0
+    assert len(found.z) == 0
