@@ -27,6 +27,21 @@ _VERTEX_STEPS = 32  # a pixel: finer than the parabola is true
 _PEAK_PX = 8  # further off is another place; by hand: ½ to 2 × alike
 
 
+class Detail(NamedTuple):
+    """What varies in an image from place to place, standardised.
+
+    Attributes
+    ----------
+    image : (H, W) float32
+        0 where it is not known.
+    mask : (H, W) float32
+        1 where it is, else 0.
+    """
+
+    image: Float32Array
+    mask: Float32Array
+
+
 class Shift(NamedTuple):
     """Where edges correlate best.
 
@@ -53,13 +68,10 @@ def best_shift(overlay: Overlay) -> Shift:
     ----------
     overlay : Overlay
     """
-    details = detail_pair(overlay)
-    (one, one_mask), (other, other_mask) = (_edges(*detail) for detail in details)
-    least = _SEARCH_OVERLAP * float(min(one_mask.sum(), other_mask.sum()))
-    scores, overlap = masked_correlation(one, one_mask, other, other_mask, least)
-    scores *= np.sqrt(np.maximum(overlap, 0.0))
+    one, other = (_edges(*detail) for detail in detail_pair(overlay))
+    scores = significance(one, other, _SEARCH_OVERLAP)
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(scores)), scores.shape))
-    height, width = one.shape
+    height, width = one.image.shape
     # steps of its own, for the last bits of a Fourier transform depend on where its memory lies
     across, down = (
         round(part * _VERTEX_STEPS) / _VERTEX_STEPS
@@ -87,20 +99,18 @@ def common_parts(
     return mine, tuple(slice(max(by, 0), min(side + by, side)) for side, by in sides)
 
 
-def _edges(detail: Float32Array, mask: Float32Array) -> tuple[Float32Array, Float32Array]:
+def _edges(detail: Float32Array, mask: Float32Array) -> Detail:
     """Gradient magnitude less its mean: blind to the sign of the contrast."""
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8))
     strength = cv2.magnitude(
         cv2.Sobel(detail, cv2.CV_32F, 1, 0), cv2.Sobel(detail, cv2.CV_32F, 0, 1)
     )
     mean = float((strength * inner).sum() / max(float(inner.sum()), 1.0))
-    return np.asarray((strength - mean) * inner, np.float32), np.asarray(inner, np.float32)
+    return Detail(np.asarray((strength - mean) * inner, np.float32), np.asarray(inner, np.float32))
 
 
-def detail_pair(
-    overlay: Overlay,
-) -> tuple[tuple[Float32Array, Float32Array], tuple[Float32Array, Float32Array]]:
-    """Template and surface, high-passed, standardised and scaled down, each with its mask."""
+def detail_pair(overlay: Overlay) -> tuple[Detail, Detail]:
+    """Template and surface, high-passed, standardised and scaled down."""
     scale = min(1.0, float(np.sqrt(_PIXELS / overlay.template.size)))
     return (
         _detail(overlay.template, overlay.template_valid, scale),
@@ -108,10 +118,8 @@ def detail_pair(
     )
 
 
-def _detail(
-    image: Float32Array, valid: BoolArray, scale: float
-) -> tuple[Float32Array, Float32Array]:
-    """High-passed, standardised image, scaled down, with its mask."""
+def _detail(image: Float32Array, valid: BoolArray, scale: float) -> Detail:
+    """High-passed, standardised image, scaled down."""
     weight = valid.astype(np.float32)
     level = float(image[valid].mean()) if valid.any() else 0.0
     centred: Float32Array = ((image - np.float32(level)) * weight).astype(np.float32)
@@ -125,21 +133,27 @@ def _detail(
     detail = (centred - smooth / np.maximum(share, _LEAST_SHARE)) * mask
     spread = float(np.sqrt((detail**2).sum() / max(float(mask.sum()), 1.0)))
     detail = np.clip(detail / max(spread, TINY), -_CLIP_SIGMAS, _CLIP_SIGMAS)
-    return np.asarray(detail, dtype=np.float32), np.asarray(mask, dtype=np.float32)
+    return Detail(np.asarray(detail, dtype=np.float32), np.asarray(mask, dtype=np.float32))
+
+
+def significance(one: Detail, other: Detail, least_share: float) -> Float32Array:
+    """(2 H − 1, 2 W − 1) correlation over its standard error, of all displacements.
+
+    It is 0 where less than a share of the smaller of the two images is common.
+    """
+    least = least_share * float(min(one.mask.sum(), other.mask.sum()))
+    scores, overlap = masked_correlation(one, other, least)
+    return np.asarray(scores * np.sqrt(np.maximum(overlap, 0.0)))
 
 
 def masked_correlation(
-    one: Float32Array,
-    one_mask: Float32Array,
-    other: Float32Array,
-    other_mask: Float32Array,
-    least_overlap: float,
+    one: Detail, other: Detail, least_overlap: float
 ) -> tuple[Float32Array, Float32Array]:
     """(2 H − 1, 2 W − 1) normalised correlation and common pixels of all displacements.
 
     The correlation is 0 where fewer than `least_overlap` pixels are common.
     """
-    height, width = one.shape
+    height, width = one.image.shape
     shape = (cv2.getOptimalDFTSize(2 * height - 1), cv2.getOptimalDFTSize(2 * width - 1))
 
     def spectrum(image: Float32Array) -> Float32Array:
@@ -153,11 +167,11 @@ def masked_correlation(
         rolled = np.roll(full, (height - 1, width - 1), axis=(0, 1))
         return np.asarray(rolled[: 2 * height - 1, : 2 * width - 1])
 
-    mask_a, mask_b = spectrum(one_mask), spectrum(other_mask)
+    mask_a, mask_b = spectrum(one.mask), spectrum(other.mask)
     overlap = correlate(mask_a, mask_b)
-    together = correlate(spectrum(one), spectrum(other))
-    power_one = correlate(spectrum(one * one), mask_b)
-    power_other = correlate(mask_a, spectrum(other * other))
+    together = correlate(spectrum(one.image), spectrum(other.image))
+    power_one = correlate(spectrum(one.image**2), mask_b)
+    power_other = correlate(mask_a, spectrum(other.image**2))
     enough = overlap > least_overlap
     power = np.sqrt(np.maximum(power_one * power_other, _LEAST_POWER))
     return np.asarray(np.where(enough, together / power, 0.0), dtype=np.float32), overlap

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from geodelreg.coarse.correlation import common_parts, detail_pair, masked_correlation
+from geodelreg.coarse.correlation import Detail, common_parts, detail_pair, significance
 from geodelreg.coarse.scopes import overview_shapes, scopes
 from geodelreg.fine.looks import mean_band
 from geodelreg.fine.overlay import overlay
@@ -182,21 +182,19 @@ def as_slopes(pair: Pair) -> Slopes | None:
         return None
     if strength.max() >= best:
         place = np.unravel_index(int(strength.argmax()), strength.shape)
-        return None if plain.shows_too(edges.finer, place) else view
+        return None if plain.shows_too(edges.finer.image, place) else view
     place = np.unravel_index(int(shaded.argmax()), shaded.shape)
     light = float(across[place]) / best, float(down[place]) / best
-    slopes = np.float32(light[0]) * x.finer + np.float32(light[1]) * y.finer
+    slopes = np.float32(light[0]) * x.finer.image + np.float32(light[1]) * y.finer.image
     return None if plain.shows_too(slopes, place) else replace(view, light=light)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beside:
-    """Details of the coarser image and of one look at the finer, on one grid, with their masks."""
+    """Details of the coarser image and of one look at the finer, on one grid."""
 
-    coarser: Float32Array
-    coarser_mask: Float32Array
-    finer: Float32Array
-    finer_mask: Float32Array
+    coarser: Detail
+    finer: Detail
 
     @classmethod
     def of(cls, pair: Pair, source: Band, reference: Band) -> _Beside:
@@ -204,16 +202,11 @@ class _Beside:
         part = roles(pair)
         template, finer = (source, reference) if part.ms_is_template else (reference, source)
         surface = make_surface(finer, part.surface.grid, _ANTIALIAS_PX)
-        one, other = detail_pair(overlay(part, template, surface, IDENTITY))
-        return cls(*one, *other)
+        return cls(*detail_pair(overlay(part, template, surface, IDENTITY)))
 
     def likeness(self) -> Float32Array:
         """Correlation over its standard error, at all displacements."""
-        least = _SEARCH_OVERLAP * float(min(self.coarser_mask.sum(), self.finer_mask.sum()))
-        scores, overlap = masked_correlation(
-            self.coarser, self.coarser_mask, self.finer, self.finer_mask, least
-        )
-        return np.asarray(scores * np.sqrt(np.maximum(overlap, 0.0)))
+        return significance(self.coarser, self.finer, _SEARCH_OVERLAP)
 
     def shows_too(self, slopes: Float32Array, place: Sequence[np.intp]) -> bool:
         """True when this look at PAN explains what its slopes, a little displaced, do not.
@@ -225,15 +218,15 @@ class _Beside:
         place : (int, int)
             In `likeness`.
         """
-        step = [side - 1 - int(i) for side, i in zip(self.coarser.shape, place, strict=True)]
-        mine, other = common_parts(self.coarser.shape, step)
+        step = [side - 1 - int(i) for side, i in zip(self.coarser.image.shape, place, strict=True)]
+        mine, other = common_parts(self.coarser.image.shape, step)
         first = np.gradient(slopes)
         second = [*np.gradient(first[0]), np.gradient(first[1])[1]]
-        good = (self.coarser_mask[mine] * self.finer_mask[other]) > 0
-        looks = [slopes, *first, *second, self.finer]
+        good = (self.coarser.mask[mine] * self.finer.mask[other]) > 0
+        looks = [slopes, *first, *second, self.finer.image]
         columns = np.stack([look[other][good] for look in looks], axis=1).astype(np.float64)
         columns -= columns.mean(axis=0)
-        target = self.coarser[mine][good].astype(np.float64)
+        target = self.coarser.image[mine][good].astype(np.float64)
         target -= target.mean()
         left = [
             float(np.square(target - some @ np.linalg.lstsq(some, target, rcond=None)[0]).sum())

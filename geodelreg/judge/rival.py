@@ -8,7 +8,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from geodelreg.coarse.correlation import around, common_parts, detail_pair, masked_correlation
+from geodelreg.coarse.correlation import (
+    Detail,
+    around,
+    common_parts,
+    detail_pair,
+    masked_correlation,
+)
 from geodelreg.fine.overlay import Overlay
 from geodelreg.fine.patches import squares
 from geodelreg.values.raster import Float32Array, FloatArray
@@ -59,13 +65,13 @@ def rival_correlation(overlay: Overlay) -> Rival:
     Rival
         NaN when the overlay is too small or has no texture.
     """
-    (one, one_mask), (other, other_mask) = detail_pair(overlay)
-    height, width = one.shape
+    one, other = detail_pair(overlay)
+    height, width = one.image.shape
     small = min(height, width) < 2 * _NEAR_PX or max(height, width) < 4 * _NEAR_PX
-    common = float((one_mask * other_mask).sum())
+    common = float((one.mask * other.mask).sum())
     if small or common < _LEAST_COMMON:
         return _UNKNOWN
-    signed, _ = masked_correlation(one, one_mask, other, other_mask, _RIVAL_OVERLAP * common)
+    signed, _ = masked_correlation(one, other, _RIVAL_OVERLAP * common)
     scores = np.abs(signed)
     middle_y, middle_x = height - 1, width - 1
     in_place = float(scores[around(middle_y, 1), around(middle_x, 1)].max())
@@ -74,9 +80,8 @@ def rival_correlation(overlay: Overlay) -> Rival:
     near = around(middle_y, _NEAR_PX), around(middle_x, _NEAR_PX)
     beside = float(_one_sided(signed[near]).max()) / in_place
     if beside > _EVEN:
-        alike, _ = masked_correlation(
-            _turned(one, other), one_mask, other, other_mask, _RIVAL_OVERLAP * common
-        )
+        turned = Detail(_turned(one.image, other.image), one.mask)
+        alike, _ = masked_correlation(turned, other, _RIVAL_OVERLAP * common)
         highest = float(np.abs(alike[around(middle_y, 1), around(middle_x, 1)]).max())
         beside = min(beside, float(_one_sided(alike[near]).max()) / highest)
     scores[near] = 0.0
@@ -88,7 +93,7 @@ def rival_correlation(overlay: Overlay) -> Rival:
         if ratio < _UNSUSPICIOUS:
             rivals.append(ratio)
             break
-        by_block = by_block or _rival_blocks(one, other)
+        by_block = by_block or _rival_blocks(one.image, other.image)
         in_blocks = by_block(middle_y - row, middle_x - column)
         rivals.append(min(ratio, in_blocks) if np.isfinite(in_blocks) else ratio)
         scores[around(row, _PEAK_PX), around(column, _PEAK_PX)] = 0.0
