@@ -68,7 +68,7 @@ def best_shift(overlay: Overlay) -> Shift:
     ----------
     overlay : Overlay
     """
-    one, other = (_edges(*detail) for detail in detail_pair(overlay))
+    one, other = (_edges(detail) for detail in detail_pair(overlay))
     scores = significance(one, other, _SEARCH_OVERLAP)
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(scores)), scores.shape))
     height, width = one.image.shape
@@ -99,11 +99,11 @@ def common_parts(
     return mine, tuple(slice(max(by, 0), min(side + by, side)) for side, by in sides)
 
 
-def _edges(detail: Float32Array, mask: Float32Array) -> Detail:
+def _edges(of: Detail) -> Detail:
     """Gradient magnitude less its mean: blind to the sign of the contrast."""
-    inner = cv2.erode(mask, np.ones((3, 3), np.uint8))
+    inner = cv2.erode(of.mask, np.ones((3, 3), np.uint8))
     strength = cv2.magnitude(
-        cv2.Sobel(detail, cv2.CV_32F, 1, 0), cv2.Sobel(detail, cv2.CV_32F, 0, 1)
+        cv2.Sobel(of.image, cv2.CV_32F, 1, 0), cv2.Sobel(of.image, cv2.CV_32F, 0, 1)
     )
     mean = float((strength * inner).sum() / max(float(inner.sum()), 1.0))
     return Detail(np.asarray((strength - mean) * inner, np.float32), np.asarray(inner, np.float32))
