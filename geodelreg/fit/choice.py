@@ -21,7 +21,7 @@ from geodelreg.options import FOLLOWING
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import TiePoints
-from geodelreg.values.raster import TINY, FloatArray, IntArray
+from geodelreg.values.raster import TINY, BoolArray, FloatArray, IntArray
 
 FOLDS = 5  # a fifth of the points is held out at a time
 _BLOCKS = 8  # 64 of them: the folds are twelve or thirteen each
@@ -236,13 +236,16 @@ def half_disagreement(points: Observations, estimate: Estimate, corners: FloatAr
     float
         ``inf`` when a half cannot determine the model.
     """
-    model = estimate.model
-    block = spatial_blocks(points.source)
+    model, block = estimate.model, spatial_blocks(points.source)
+
+    def both_fix(half: BoolArray) -> bool:
+        return min(int(half.sum()), int((~half).sum())) >= minimum_points(model)
+
     white = (block % _BLOCKS + block // _BLOCKS) % 2 == 0
-    if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
+    if not both_fix(white):
         # a few points may all lie on one colour: then every other one of them, row by row
         white = np.argsort(np.argsort(block, kind="stable")) % 2 == 0
-    if min(int(white.sum()), int((~white).sum())) < minimum_points(model):
+    if not both_fix(white):
         return float("inf")
     weight = _precision(points, estimate)
     ends = []

@@ -167,14 +167,11 @@ def stars_of(targets: FloatArray, xy: FloatArray, own: Star) -> Star:
     nearest = STRtree(np.asarray(points(xy))).nearest(np.asarray(points(targets)))
     start = np.searchsorted(own.target, np.arange(len(xy) + 1))
     size = np.diff(start)[nearest]
-    target = np.repeat(np.arange(len(targets)), size + 1)
-    member = np.empty(len(target), dtype=np.intp)
-    first = np.cumsum(size + 1) - size - 1
-    member[first] = nearest
-    rest = np.ones(len(target), dtype=np.bool_)
-    rest[first] = False
-    member[rest] = own.member[np.repeat(start[nearest], size) + running(size)]
-    return Star(target, member)
+    number = np.arange(len(targets))
+    target = np.concatenate([number, np.repeat(number, size)])
+    around = own.member[np.repeat(start[nearest], size) + running(size)]
+    order = np.argsort(target, kind="stable")
+    return Star(target[order], np.concatenate([nearest, around])[order])
 
 
 def running(sizes: IntArray) -> IntArray:
