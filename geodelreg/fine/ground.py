@@ -10,7 +10,9 @@ from geodelreg.fine.clouds import CloudLook, cloud_look
 from geodelreg.fine.motions import (
     LEAST_PATCHES,
     LEAST_SHARE,
+    TORN_SHARE,
     Motion,
+    is_cut_off,
     is_solid,
     layers,
     second_motion,
@@ -87,6 +89,8 @@ def other_motion(
 ) -> Motion | None:
     """The largest motion besides the ground's, if so many share it that no result may ignore it.
 
+    Of a part that is cut off fewer do: clouds are not cut off by lines.
+
     Strips one patch wide are no layer, for most of their neighbours are the ground's; they count
     when they agree, and no other patches lie among them.
 
@@ -108,22 +112,23 @@ def other_motion(
     -------
     Motion or None
     """
-    least = max(LEAST_SHARE * textured, LEAST_PATCHES)
+    some, many = (max(share * textured, LEAST_PATCHES) for share in (TORN_SHARE, LEAST_SHARE))
+
+    def matters(member: BoolArray) -> bool:
+        count, ground = member.sum(), label == 0
+        return bool(count >= many or (count >= some and is_cut_off(source, member, ground)))
+
     found = []
     for number in range(1, int(label.max(initial=0)) + 1):
         member = label == number
         centre = np.median(move[member], axis=0)
-        if member.sum() < least or not np.hypot(*centre) > ANOTHER_PX:
+        if not np.hypot(*centre) > ANOTHER_PX or not matters(member):
             continue
         both = member | (label == 0)
         if not cloud_look(source[both], member[both], brightest[both]).explains:
             found.append(Motion(member, centre))
     strays = (label < 0) & (np.hypot(*move.T) > ANOTHER_PX)
     strip = second_motion(move, strays, ANOTHER_PX, reach_px)
-    if (
-        strip is not None
-        and strip.member.sum() >= least
-        and is_solid(source, strip.member, label == 0)
-    ):
+    if strip is not None and matters(strip.member) and is_solid(source, strip.member, label == 0):
         found.append(strip)
     return max(found, key=lambda motion: int(motion.member.sum()), default=None)

@@ -19,6 +19,8 @@ from geodelreg.values.maps import PixelMap
 from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 
 LEAST_SHARE = 0.05  # by hand: ½ to 2 × alike
+TORN_SHARE = 0.02
+"""The same of a part that a line cuts off, as no cloud is cut: 20 px off, it leaves 3 px RMS."""
 LEAST_PATCHES = 4
 """That agree on another motion: less than one pair in a thousand has so many by chance, and a
 raster of 40 patches has no more in a tenth of its area."""
@@ -26,6 +28,7 @@ _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
 _SOLID = 0.9  # by hand: ½ to 2 × alike
 _ROUNDING_PX = 1e-6  # by hand: ½ to 2 × alike
+_DIRECTIONS = 16  # of a tear; those at a slant between two of them are cut off by most of a line
 _CORE = 0.75
 """Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
 those astride a tear fit to both sides a little, and to neither well."""
@@ -184,3 +187,19 @@ def is_solid(xy: FloatArray, member: BoolArray, ground: BoolArray) -> bool:
     around = MultiPoint(xy[member]).convex_hull.buffer(_ROUNDING_PX)
     inside = contains_xy(around, xy[:, 0], xy[:, 1])
     return bool(member[inside].sum() >= _SOLID * (member | ground)[inside].sum())
+
+
+def is_cut_off(xy: FloatArray, member: BoolArray, ground: BoolArray) -> bool:
+    """True when a line has hardly any but the members on one side, and most of them there.
+
+    Parameters
+    ----------
+    xy, member, ground
+        As for `is_solid`.
+    """
+    angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
+    along = xy @ np.stack([np.cos(angle), np.sin(angle)])
+    line = np.quantile(along[member], 1.0 - _SOLID, axis=0)
+    beyond = along >= line - _ROUNDING_PX
+    members, all_placed = (beyond[who].sum(axis=0) for who in (member, member | ground))
+    return bool((members >= _SOLID * all_placed).any())

@@ -14,7 +14,7 @@ import numpy as np
 
 from geodelreg.fine.overlay import Overlay
 from geodelreg.fine.texture import noise_of, show_texture
-from geodelreg.fine.tiles import patch_size
+from geodelreg.fine.tiles import PATCH_PX, patch_size
 from geodelreg.values.raster import BoolArray, Float32Array, FloatArray
 
 REACH_PX = 22
@@ -64,7 +64,9 @@ class Places:
         return np.asarray(better * np.sqrt(independent / 2))
 
 
-def survey(overlay: Overlay, grid: tuple[str, str] = ("centred", "centred")) -> Places:
+def survey(
+    overlay: Overlay, grid: tuple[str, str] = ("centred", "centred"), largest_px: int = PATCH_PX
+) -> Places:
     """Correlate every patch with all places up to `REACH_PX` pixels away.
 
     Parameters
@@ -74,12 +76,17 @@ def survey(overlay: Overlay, grid: tuple[str, str] = ("centred", "centred")) -> 
     grid : (str, str)
         Of patches, across and down: side by side and ``centred``, ``flush`` with the borders, or
         ``between`` those.
+    largest_px : int
+        Side of a patch at most.
     """
-    size = patch_size(float(overlay.valid.sum()))
+    size = min(patch_size(float(overlay.valid.sum())), largest_px)
     template = _filled(overlay.template, overlay.template_valid)
     surface = _filled(overlay.surface, overlay.surface_valid)
     reach, (height, width) = REACH_PX, template.shape
-    padded = cv2.copyMakeBorder(surface, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
+    padded, seen = (
+        np.pad(image, reach) for image in (surface, overlay.surface_valid.astype(np.float32))
+    )
+    seen = np.asarray(cv2.boxFilter(seen, cv2.CV_32F, (size, size), anchor=(0, 0)), np.float32)
     across, down = (
         _starts(length, size, how) for length, how in zip((width, height), grid, strict=True)
     )
@@ -97,7 +104,8 @@ def survey(overlay: Overlay, grid: tuple[str, str] = ("centred", "centred")) -> 
         patches[number] = patch
         window = padded[top : top + size + 2 * reach, left : left + size + 2 * reach]
         scores = np.abs(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
-        scores[~np.isfinite(scores) | (scores > _ROUNDED_R)] = 0.0
+        there = seen[top : top + len(scores), left : left + len(scores)]
+        scores[~np.isfinite(scores) | (scores > _ROUNDED_R) | (there < _LEAST_VALID)] = 0.0
         row, column = (int(i) for i in np.unravel_index(int(scores.argmax()), scores.shape))
         move[number] = column + beyond(scores[row], column), row + beyond(scores[:, column], row)
         score[number], here[number] = scores[row, column], scores[reach, reach]

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from geodelreg.fine.motions import LEAST_SHARE
+from geodelreg.fine.motions import LEAST_SHARE, TORN_SHARE
 from geodelreg.fit.field import FEWEST_POINTS, MOST_STRAIN
 from geodelreg.options import AlignOptions
 from geodelreg.pair import LATTICE, Pair
@@ -155,7 +155,7 @@ def judge(evidence: Evidence, options: AlignOptions) -> tuple[Reason, ...]:
         ("repeated", "≤", repeated, f"{_OFF_WHAT_IS_DRAWN} ({evidence.repeated_words})"),
         ("bands", "≤", MAX_BANDS_PX, f"{_BANDS_APART}{which}"),
         _strain_limit(evidence.strain),
-        ("two_motions", "≤", LEAST_SHARE, f"of the patches follow another motion{where}"),
+        ("two_motions", "≤", TORN_SHARE, f"of the patches follow another motion{where}"),
         ("local", "≤", most_px, "PAN px RMS at least is left of the ground's bend"),
     )
     values = asdict(evidence) | {

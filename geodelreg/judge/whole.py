@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from affine import Affine
@@ -17,6 +18,7 @@ from geodelreg.fine.motions import LEAST_PATCHES, largest_layer
 from geodelreg.fine.overlay import Overlay, overlay
 from geodelreg.fine.passes import Refinement, bends_gently
 from geodelreg.fine.survey import REACH_PX, Places, survey
+from geodelreg.fine.tiles import PATCH_PX, SMALLEST_PATCH_PX
 from geodelreg.fine.tone import single_band
 from geodelreg.fit.choice import Fitted
 from geodelreg.fit.consensus import fit_plainly
@@ -212,10 +214,11 @@ def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> tupl
     """The same as `_other_motion` of patches on other grids, where there are few on one.
 
     A part no wider than a patch or two lies astride two rows of one grid, and fills a row of
-    another.  Of so few patches brightness proves no cloud; a part that is bright is left to clouds.
+    another, or of smaller patches.  Of so few patches brightness proves no cloud; a part that is
+    bright is left to clouds.
     """
-    for grid in _GRIDS:
-        places = survey(images, grid=grid)
+    for largest_px, grid in product((PATCH_PX, SMALLEST_PATCH_PX), _GRIDS):
+        places = survey(images, grid, largest_px)
         index = np.flatnonzero(_placed(places))
         gone = np.hypot(*places.move[index].T) > ANOTHER_PX
         if gone.sum() < LEAST_PATCHES or (~gone).sum() < FEWEST_POINTS:

@@ -52,7 +52,7 @@ UPPER = {
     "bands_apart": 0.5,
     "keypoints_apart": 2.0,
     "residual_low_px": 0.5,
-    "moved": 0.05,
+    "moved": 0.02,
     "bands": 1.0,
 }
 LOWER = {"points": 8, "coverage": 0.05, "support": 0.5}

@@ -212,3 +212,17 @@ def test_a_strip_one_patch_wide_counts_and_scattered_patches_do_not() -> None:
         found = other_motion(xy, move, label, brightest(moves, 0.0, rng), len(xy), 22.0)
         assert (found is not None) == counts
         assert found is None or (found.member == moves).all()
+
+
+def test_less_of_what_a_line_cuts_off_counts_than_of_what_lies_amid_the_ground() -> None:
+    rng, xy = np.random.default_rng(13), lattice(20)
+    low, x = np.sort(np.unique(xy[:, 1]))[-1], xy[:, 0]
+    corner = xy.sum(axis=1) > np.sort(xy.sum(axis=1))[-13]
+    amid = np.abs(xy - np.median(xy, axis=0)).max(axis=1) < 45
+    strip = (xy[:, 1] >= low) & (x < np.quantile(x, 0.7))
+    for moves, counts in ((corner, True), (amid, False), (strip, False), (xy[:, 1] >= low, True)):
+        assert 0.02 < moves.mean() <= 0.05
+        move = noisy(np.where(moves[:, None], [[8.0, -3.0]], 0.0), rng)
+        label = layers(xy, move, np.full(len(xy), 0.04))
+        found = other_motion(xy, move, label, brightest(moves, 0.0, rng), len(xy), 22.0)
+        assert (found is not None) == counts

@@ -56,3 +56,13 @@ def test_of_images_that_show_nothing_together_no_patch_is_placed() -> None:
     found = survey(Overlay(image, image, hidden, hidden))
     assert len(found.centre) == len(found.move) == len(found.brightest) == 0
     assert len(found.z) == 0
+
+
+def test_nothing_lies_where_an_image_has_ended() -> None:
+    """Beyond it all is flat, and what is divided by the spread of nothing is anything."""
+    image, other = texture((240, 178), 5), texture((240, 178), 6)
+    found = survey(overlay(image, other), ("flush", "flush"), 12)
+    assert found.size == 12
+    there = found.centre + found.move
+    assert (there > 0).all()
+    assert (there < [178, 240]).all()
