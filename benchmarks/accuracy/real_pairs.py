@@ -74,6 +74,8 @@ PAIRS: tuple[Pair, ...] = (
     Pair("sentinel2 20 m on B04", SENTINEL_MS, SENTINEL_PAN, 3),
     Pair("sentinel2 20 m on B08", SENTINEL_MS, SENTINEL_PAN, 4),
     Pair("cbers4a", "cbers4a/ms.tif", "cbers4a/pan.tif", window_px=24, stride_px=8),
+    # Buildings lean; the second and the third are half no data, which no header says.
+    *(Pair(f"rotterdam {n}", f"rotterdam/ms{n}.tif", f"rotterdam/pan{n}.tif") for n in (1, 2, 3)),
     Pair("naip 2012/2014", NAIP.format(20120731), NAIP.format(20140720), 4, 0, 64, 32),
     Pair("naip 2018/2019", NAIP.format(20180716), NAIP.format(20190904), 4, 0, 64, 32),
     Pair(
