@@ -16,6 +16,7 @@ from geodelreg.fine.overlay import Overlay
 from geodelreg.fine.survey import beyond
 from geodelreg.values.raster import TINY, BoolArray, Float32Array, FloatArray
 
+AMBIGUOUS = 0.8  # rivals of repeated texture are 0.84 to 1, of others 0.1 to 0.8
 _PIXELS = 90_000  # at most, 300²; by hand: ½ to 2 × alike
 _SEARCH_OVERLAP = 0.15  # of the smaller image; by hand: ½ to 2 × alike
 _HIGH_PASS_SIGMA_PX = 4.0

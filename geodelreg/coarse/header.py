@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from affine import Affine
 
-from geodelreg.coarse.correlation import best_shift
+from geodelreg.coarse.correlation import AMBIGUOUS, best_shift
 from geodelreg.fine.layers import ELSEWHERE, SURE_LOG_NFA, Pass
 from geodelreg.fine.least_squares import MAX_MOVE, ROUGH_STEP, MatchOptions
 from geodelreg.fine.looks import mean_band
@@ -29,7 +29,6 @@ logger = logging.getLogger(__name__)
 
 _EDGE_SIGMA_PX = 0.5
 _TONE_SAMPLES = 4_000  # half of the last pass; by hand: ½ to 2 × alike
-_RIVAL = 0.8  # of repeated texture 0.84 to 1, of others 0.1 to 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -65,7 +64,7 @@ def proven_guess(pair: Pair, images: Overview) -> ProvenGuess | None:
         None = look with keypoints, which know rotations, large scales and clouds.
     """
     guess, rival = _by_edges(pair, images)
-    if rival > _RIVAL:
+    if rival > AMBIGUOUS:
         return None
     part = roles(pair)
     tile = overview_tile(part, images)

@@ -125,7 +125,8 @@ def other_motion(
         if not np.hypot(*centre) > ANOTHER_PX or not matters(member):
             continue
         both = member | (label == 0)
-        if not cloud_look(source[both], member[both], brightest[both]).explains:
+        cut_off = is_cut_off(source, member, label == 0)
+        if cut_off or not cloud_look(source[both], member[both], brightest[both]).explains:
             found.append(Motion(member, centre))
     strays = (label < 0) & (np.hypot(*move.T) > ANOTHER_PX)
     strip = second_motion(move, strays, ANOTHER_PX, reach_px)

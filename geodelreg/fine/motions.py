@@ -28,6 +28,7 @@ _CHANCE = 1e-3
 """Expected false alarms a pair, the usual ε of a-contrario methods scaled to a thousand pairs."""
 _SOLID = 0.9  # by hand: ½ to 2 × alike
 _ROUNDING_PX = 1e-6  # by hand: ½ to 2 × alike
+_ASTRIDE = 0.2  # of a part that is cut off: patches on the line are told as of either side
 _DIRECTIONS = 16  # of a tear; those at a slant between two of them are cut off by most of a line
 _CORE = 0.75
 """Share of its neighbours that a patch fits to, for it to join them to one layer (as in DBSCAN):
@@ -199,7 +200,7 @@ def is_cut_off(xy: FloatArray, member: BoolArray, ground: BoolArray) -> bool:
     """
     angle = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     along = xy @ np.stack([np.cos(angle), np.sin(angle)])
-    line = np.quantile(along[member], 1.0 - _SOLID, axis=0)
+    line = np.quantile(along[member], _ASTRIDE, axis=0)
     beyond = along >= line - _ROUNDING_PX
     members, all_placed = (beyond[who].sum(axis=0) for who in (member, member | ground))
     return bool((members >= _SOLID * all_placed).any())

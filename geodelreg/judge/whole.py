@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from affine import Affine
 
+from geodelreg.coarse.correlation import AMBIGUOUS, best_shift
 from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
 from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motion
 from geodelreg.fine.layers import CALM_PATCHES, MATCHED
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
-from geodelreg.fine.motions import LEAST_PATCHES, largest_layer
+from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE, is_cut_off, largest_layer
 from geodelreg.fine.overlay import Overlay, overlay
 from geodelreg.fine.passes import Refinement, bends_gently
 from geodelreg.fine.survey import REACH_PX, Places, survey
@@ -53,6 +55,17 @@ _MOST_POINTS = 1000  # by hand: ½ to 2 × alike
 _PLACES = 200  # by hand: ½ to 2 × alike
 _STRAIN_PLACES = 33  # along either axis of the raster
 _VISIBLE = 3  # bands, as they are usually ordered
+
+
+class _Moved(NamedTuple):
+    """Another motion: share of the textured patches, where they lie, if a line cuts them off."""
+
+    share: float = 0.0
+    words: str = ""
+    is_cut_off: bool = False
+
+
+_NOTHING = _Moved()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,8 +207,8 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     if textured >= _FEW_PATCHES:
         return agreed
     # few patches leave out a border as wide as a small part
-    moved, words = _small_motion(refined, *_overlaid(guess, refined, correction))
-    return replace(agreed, moved=moved, words=words)
+    moved = _small_motion(refined, *_overlaid(guess, refined, correction))
+    return replace(agreed, moved=moved.share, words=moved.words)
 
 
 def _overlaid(guess: Guess, refined: Refinement, correction: PixelMap) -> tuple[Overlay, Affine]:
@@ -210,7 +223,7 @@ def _unit(to_full: Affine) -> float:
     return float(np.sqrt(abs(to_full.determinant)))
 
 
-def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> tuple[float, str]:
+def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> _Moved:
     """The same as `_other_motion` of patches on other grids, where there are few on one.
 
     A part no wider than a patch or two lies astride two rows of one grid, and fills a row of
@@ -224,12 +237,10 @@ def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> tupl
         if gone.sum() < LEAST_PATCHES or (~gone).sum() < FEWEST_POINTS:
             continue
         ground = _ground_of(places, index)
-        if ground.look.outshining >= OUTSHINING:
-            continue
-        moved, words = _other_motion(refined, places, index, ground, to_full)
-        if moved:
-            return moved, words
-    return 0.0, ""
+        moved = _other_motion(refined, places, index, ground, to_full)
+        if moved.share and (moved.is_cut_off or ground.look.outshining < OUTSHINING):
+            return moved
+    return _NOTHING
 
 
 def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
@@ -254,17 +265,39 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
         apply_affine(to_full, at[far]), position, covariance, none, none.astype(np.uint8)
     )
     whole, gentle = _bent(refined, correction, agreed, observe(part, seen, correction))
+    moved = _other_motion(refined, places, index, ground, to_full)
     # what a smooth field explains is no cloud, however bright and high above the ground
-    if ground.look.explains and not gentle:
+    if ground.look.explains and not gentle and not moved.is_cut_off:
         return replace(agreed, clouds=ground.moving)
-    moved, words = _other_motion(refined, places, index, ground, to_full)
-    if not moved and len(places.centre) < _FEW_PATCHES:
-        moved, words = _small_motion(refined, images, to_full)
-    if moved or (whole.is_bent(part.pair.options) and not gentle):
+    if not moved.share and len(places.centre) < _FEW_PATCHES:
+        moved = _small_motion(refined, images, to_full)
+    if not moved.share:
+        moved = _far_motion(refined, images, places, to_full)
+    if moved.share or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
             return replace(agreed, clouds=height.share)
-    return replace(whole, moved=moved, words=words)
+    return replace(whole, moved=moved.share, words=moved.words)
+
+
+def _far_motion(refined: Refinement, images: Overlay, places: Places, to_full: Affine) -> _Moved:
+    """Where a side of MS lies that shows something and matches nothing within reach.
+
+    It is sought as one piece over the whole of the other image.
+    """
+    near = _placed(places) & (np.hypot(*places.move.T) <= ANOTHER_PX)
+    astray = places.textured & ~near
+    least = max(LEAST_SHARE * int(places.textured.sum()), LEAST_PATCHES)
+    if astray.sum() < least or not is_cut_off(places.centre, astray, near):
+        return _NOTHING
+    shown, half = np.zeros_like(images.template_valid), places.size / 2
+    for left, top in (places.centre[astray] - half).astype(int):
+        shown[top : top + places.size, left : left + places.size] = True
+    piece = replace(images, template_valid=images.template_valid & shown)
+    found = best_shift(piece)
+    if found.rival > AMBIGUOUS or not np.hypot(*found.move) > ANOTHER_PX:
+        return _NOTHING
+    return _moved(refined, places, places.textured, astray[places.textured], found.move, to_full)
 
 
 def _ground_of(places: Places, index: IntArray) -> Ground:
@@ -313,20 +346,35 @@ def _placed(places: Places) -> BoolArray:
 
 def _other_motion(
     refined: Refinement, places: Places, index: IntArray, ground: Ground, to_full: Affine
-) -> tuple[float, str]:
-    """Share of the textured patches with the largest other motion, and where they lie, in words."""
-    part, at, move = refined.part, places.centre[index], places.move[index]
+) -> _Moved:
+    """The largest other motion."""
+    at, move = places.centre[index], places.move[index]
     apart = move - np.median(move[ground.member], axis=0)
     textured = int(places.textured.sum())
     bright = places.brightest[index]
     motion = other_motion(at, apart, ground.label, bright, textured, REACH_PX)
     if motion is None:
-        return 0.0, ""
-    share = float(motion.member.sum()) / textured
+        return _NOTHING
+    cut_off = is_cut_off(at, motion.member, ground.label == 0)
+    moved = _moved(refined, places, index, motion.member, motion.move, to_full)
+    return moved._replace(is_cut_off=cut_off)
+
+
+def _moved(
+    refined: Refinement,
+    places: Places,
+    among: IntArray | BoolArray,
+    member: BoolArray,
+    move: FloatArray,
+    to_full: Affine,
+) -> _Moved:
+    """What is said of members among some of the patches, (2,) pixels of the overlay off."""
+    part = refined.part
     size = places.centre.max(axis=0) + places.centre.min(axis=0)
-    step = motion.move * _unit(to_full) * part.pan_px_per_patch_px / part.step
+    step = move * _unit(to_full) * part.pan_px_per_patch_px / part.step
     place = lies(-step if part.ms_is_template else step)
-    return share, f"{region(at, motion.member, size)} {place}"
+    share = float(member.sum()) / int(places.textured.sum())
+    return _Moved(share, f"{region(places.centre[among], member, size)} {place}", True)
 
 
 def _bent(

@@ -236,9 +236,14 @@ def followed_part(points: TiePoints, pair: Pair, move_px: FloatArray) -> str:
     )
 
 
+def _short(size: float) -> str:
+    """Two digits, or all before the point."""
+    return f"{size:.{max(2, len(str(int(size))))}g}"
+
+
 def lies(move_px: FloatArray, rest: str = "the rest") -> str:
     """Where a part lies that is (2,) PAN pixels right and down of the rest, in words."""
     right, down = (float(v) for v in move_px)
-    across = f"{abs(right):.2g} px {'right' if right >= 0 else 'left'}"
-    along = f"{abs(down):.2g} px {'down' if down >= 0 else 'up'}"
+    across = f"{_short(abs(right))} px {'right' if right >= 0 else 'left'}"
+    along = f"{_short(abs(down))} px {'down' if down >= 0 else 'up'}"
     return f"lies {across} and {along} of {rest}"

@@ -208,6 +208,26 @@ def test_a_raster_of_a_few_patches_is_not_torn_in_silence(name: str, tmp_path: P
     assert "two_motions" in failed(refusal(torn)[1])
 
 
+ROLLED = {"bright": (0.25, 15, 60), "beyond reach": (0.25, 40, 160), "nearly half": (0.5, 60, 240)}
+
+
+@pytest.mark.parametrize("name", ROLLED)
+def test_a_side_that_went_far_is_no_cloud_and_is_told_where_it_went(
+    name: str, tmp_path: Path
+) -> None:
+    share, moved_px, pan_px = ROLLED[name]
+    with rasterio.open(SAMPLE / "ms.tif") as raster:
+        bands, profile = raster.read(), raster.profile
+    low = slice(round(bands.shape[1] * (1 - share)), None)
+    bands[:, low] = np.roll(bands[:, low], moved_px, axis=2)
+    with rasterio.open(tmp_path / "ms.tif", "w", **profile) as out:
+        out.write(bands)
+    with pytest.raises(AlignmentRefusedError, match=f"lower .* lies {pan_px} px right") as caught:
+        geodelreg.align(tmp_path / "ms.tif", SAMPLE / "pan.tif")
+    assert caught.value.alignment is not None
+    assert failed(caught.value.alignment) == {"two_motions"}
+
+
 def test_no_second_guess_of_a_place_makes_torn_ground_whole(tmp_path: Path) -> None:
     """Read otherwise, the images show a patch less of the torn part, and too few for a motion."""
     small = replace(
