@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import NamedTuple
 
 import numpy as np
-from affine import Affine
 
-from geodelreg.coarse.correlation import AMBIGUOUS, best_shift
-from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
-from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motion
+from geodelreg.fine.clouds import HeightParallax, height_parallax
 from geodelreg.fine.layers import CALM_PATCHES, MATCHED
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
-from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE, is_cut_off, largest_layer
-from geodelreg.fine.overlay import Overlay, overlay
+from geodelreg.fine.motions import largest_layer
 from geodelreg.fine.passes import Refinement, bends_gently
-from geodelreg.fine.survey import REACH_PX, Places, survey
-from geodelreg.fine.tiles import PATCH_PX, SMALLEST_PATCH_PX
+from geodelreg.fine.survey import survey
 from geodelreg.fine.tone import single_band
 from geodelreg.fit.choice import Fitted
 from geodelreg.fit.consensus import fit_plainly
@@ -30,42 +23,33 @@ from geodelreg.fit.residual import Residual, residual_of, shared_by_neighbours
 from geodelreg.geo.affine import affine_matrix, apply_affine
 from geodelreg.geo.maps.field import FieldMap
 from geodelreg.geo.maps.tin import TinMap
-from geodelreg.judge.evidence import decimated
+from geodelreg.judge.elsewhere import (
+    FEW_PATCHES,
+    SURVEY_SIGMA_PX,
+    another_motion,
+    far_motion,
+    ground_of,
+    overlaid,
+    placed,
+    small_motion,
+    unit_of,
+)  # fmt: skip
 from geodelreg.judge.verdict import Evidence
-from geodelreg.judge.words import lies, region
 from geodelreg.options import AlignOptions
 from geodelreg.pair import Pair
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess, Status
-from geodelreg.values.raster import BoolArray, FloatArray, IntArray, StatusArray
+from geodelreg.values.raster import BoolArray, FloatArray, StatusArray
 from geodelreg.values.result import Accuracy
 
 _CALM_SHARE = 0.98
 """Of the textured patches that agree, from which no part that matters can lie elsewhere."""
 _CALM_RESIDUAL = 0.3
 """Of the largest residual allowed: what neighbours may share where no field need be fitted."""
-_PLACED_SCORE = 0.5
-_SURE_Z = 3.0
-_FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
-_GRIDS = (
-    ("flush", "flush"), ("between", "flush"), ("flush", "between"), ("between", "between"),
-)  # fmt: skip
-_SURVEY_SIGMA_PX = 0.05  # by hand: ½ refuses 1 of 36
 _MOST_POINTS = 1000  # by hand: ½ to 2 × alike
 _PLACES = 200  # by hand: ½ to 2 × alike
 _STRAIN_PLACES = 33  # along either axis of the raster
 _VISIBLE = 3  # bands, as they are usually ordered
-
-
-class _Moved(NamedTuple):
-    """Another motion: share of the textured patches, where they lie, if a line cuts them off."""
-
-    share: float = 0.0
-    words: str = ""
-    is_cut_off: bool = False
-
-
-_NOTHING = _Moved()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,58 +188,26 @@ def look_at_whole(guess: Guess, refined: Refinement, correction: PixelMap) -> Wh
     agreed = Whole(near, np.asarray(kept))
     if not calm:
         return _surveyed(guess, refined, correction, agreed)
-    if textured >= _FEW_PATCHES:
+    if textured >= FEW_PATCHES:
         return agreed
     # few patches leave out a border as wide as a small part
-    moved = _small_motion(refined, *_overlaid(guess, refined, correction))
+    moved = small_motion(refined, *overlaid(guess, refined, correction))
     return replace(agreed, moved=moved.share, words=moved.words)
-
-
-def _overlaid(guess: Guess, refined: Refinement, correction: PixelMap) -> tuple[Overlay, Affine]:
-    """Both images, decimated, bright objects too, and pixels of that to those of the template."""
-    template, _, surface = decimated(guess, refined, dark=False)
-    to_full = ~refined.part.template.grid.transform @ template.grid.transform
-    return overlay(refined.part, template, surface, correction), to_full
-
-
-def _unit(to_full: Affine) -> float:
-    """Pixels of full resolution in one of a decimated image, along an axis."""
-    return float(np.sqrt(abs(to_full.determinant)))
-
-
-def _small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> _Moved:
-    """The same as `_other_motion` of patches on other grids, where there are few on one.
-
-    A part no wider than a patch or two lies astride two rows of one grid, and fills a row of
-    another, or of smaller patches.  Of so few patches brightness proves no cloud; a part that is
-    bright is left to clouds.
-    """
-    for largest_px, grid in product((PATCH_PX, SMALLEST_PATCH_PX), _GRIDS):
-        places = survey(images, grid, largest_px)
-        index = np.flatnonzero(_placed(places))
-        gone = np.hypot(*places.move[index].T) > ANOTHER_PX
-        if gone.sum() < LEAST_PATCHES or (~gone).sum() < FEWEST_POINTS:
-            continue
-        ground = _ground_of(places, index)
-        moved = _other_motion(refined, places, index, ground, to_full)
-        if moved.share and (moved.is_cut_off or ground.look.outshining < OUTSHINING):
-            return moved
-    return _NOTHING
 
 
 def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: Whole) -> Whole:
     """Where every patch lies: the ground's, another motion's, or a cloud's."""
     part = refined.part
-    images, to_full = _overlaid(guess, refined, correction)
+    images, to_full = overlaid(guess, refined, correction)
     places = survey(images)
-    index = np.flatnonzero(_placed(places))
+    index = np.flatnonzero(placed(places))
     if len(index) < FEWEST_POINTS:
         return _bent(refined, correction, agreed)[0]
     at, move = places.centre[index], places.move[index]
-    ground = _ground_of(places, index)
-    unseen = refined.dark_only | (np.hypot(*move.T) * _unit(to_full) > MAX_MOVE * part.step)
+    ground = ground_of(places, index)
+    unseen = refined.dark_only | (np.hypot(*move.T) * unit_of(to_full) > MAX_MOVE * part.step)
     far = ground.member & unseen
-    linear = affine_matrix(to_full)[:, :2] * _SURVEY_SIGMA_PX
+    linear = affine_matrix(to_full)[:, :2] * SURVEY_SIGMA_PX
     there = part.to_surface(correction)
     position, covariance = there.carry(
         apply_affine(to_full, (at + move)[far]), np.tile(linear @ linear.T, (int(far.sum()), 1, 1))
@@ -265,45 +217,19 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
         apply_affine(to_full, at[far]), position, covariance, none, none.astype(np.uint8)
     )
     whole, gentle = _bent(refined, correction, agreed, observe(part, seen, correction))
-    moved = _other_motion(refined, places, index, ground, to_full)
+    moved = another_motion(refined, places, index, ground, to_full)
     # what a smooth field explains is no cloud, however bright and high above the ground
     if ground.look.explains and not gentle and not moved.is_cut_off:
         return replace(agreed, clouds=ground.moving)
-    if not moved.share and len(places.centre) < _FEW_PATCHES:
-        moved = _small_motion(refined, images, to_full)
+    if not moved.share and len(places.centre) < FEW_PATCHES:
+        moved = small_motion(refined, images, to_full)
     if not moved.share:
-        moved = _far_motion(refined, images, places, to_full)
+        moved = far_motion(refined, images, places, to_full)
     if moved.share or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
         if height is not None and height.explains:
             return replace(agreed, clouds=height.share)
     return replace(whole, moved=moved.share, words=moved.words)
-
-
-def _far_motion(refined: Refinement, images: Overlay, places: Places, to_full: Affine) -> _Moved:
-    """Where a side of MS lies that shows something and matches nothing within reach.
-
-    It is sought as one piece over the whole of the other image.
-    """
-    near = _placed(places) & (np.hypot(*places.move.T) <= ANOTHER_PX)
-    astray = places.textured & ~near
-    least = max(LEAST_SHARE * int(places.textured.sum()), LEAST_PATCHES)
-    if astray.sum() < least or not is_cut_off(places.centre, astray, near):
-        return _NOTHING
-    shown, half = np.zeros_like(images.template_valid), places.size / 2
-    for left, top in (places.centre[astray] - half).astype(int):
-        shown[top : top + places.size, left : left + places.size] = True
-    piece = replace(images, template_valid=images.template_valid & shown)
-    found = best_shift(piece)
-    if found.rival > AMBIGUOUS or not np.hypot(*found.move) > ANOTHER_PX:
-        return _NOTHING
-    return _moved(refined, places, places.textured, astray[places.textured], found.move, to_full)
-
-
-def _ground_of(places: Places, index: IntArray) -> Ground:
-    at = places.centre[index]
-    doubt = np.full(len(index), _SURVEY_SIGMA_PX**2)
-    return find_ground(at, at + places.move[index], doubt, places.brightest[index])
 
 
 def _height(refined: Refinement, correction: PixelMap) -> HeightParallax | None:
@@ -335,46 +261,6 @@ def _moves(status: StatusArray, points: Observations, correction: PixelMap) -> F
     matched = np.isin(status, MATCHED)
     matched &= np.isfinite(points.covariance).all(axis=(1, 2))
     return np.where(matched[:, None], points.target - correction.forward(points.source), np.nan)
-
-
-def _placed(places: Places) -> BoolArray:
-    """(P,) True for textured patches whose best place is theirs."""
-    near = np.hypot(*places.move.T) <= MAX_MOVE
-    sure = near | (places.z > _SURE_Z)
-    return np.asarray(places.textured & (places.score > _PLACED_SCORE) & sure)
-
-
-def _other_motion(
-    refined: Refinement, places: Places, index: IntArray, ground: Ground, to_full: Affine
-) -> _Moved:
-    """The largest other motion."""
-    at, move = places.centre[index], places.move[index]
-    apart = move - np.median(move[ground.member], axis=0)
-    textured = int(places.textured.sum())
-    bright = places.brightest[index]
-    motion = other_motion(at, apart, ground.label, bright, textured, REACH_PX)
-    if motion is None:
-        return _NOTHING
-    cut_off = is_cut_off(at, motion.member, ground.label == 0)
-    moved = _moved(refined, places, index, motion.member, motion.move, to_full)
-    return moved._replace(is_cut_off=cut_off)
-
-
-def _moved(
-    refined: Refinement,
-    places: Places,
-    among: IntArray | BoolArray,
-    member: BoolArray,
-    move: FloatArray,
-    to_full: Affine,
-) -> _Moved:
-    """What is said of members among some of the patches, (2,) pixels of the overlay off."""
-    part = refined.part
-    size = places.centre.max(axis=0) + places.centre.min(axis=0)
-    step = move * _unit(to_full) * part.pan_px_per_patch_px / part.step
-    place = lies(-step if part.ms_is_template else step)
-    share = float(member.sum()) / int(places.textured.sum())
-    return _Moved(share, f"{region(places.centre[among], member, size)} {place}", True)
 
 
 def _bent(
