@@ -66,11 +66,3 @@ def test_nothing_lies_where_an_image_has_ended() -> None:
     there = found.centre + found.move
     assert (there > 0).all()
     assert (there < [178, 240]).all()
-
-
-def test_of_stripes_that_leave_no_patch_whole_none_is_asked() -> None:
-    image = texture((120, 120), 7)
-    valid = np.ones(image.shape, dtype=bool)
-    valid[::4] = valid[1::4] = False
-    found = survey(Overlay(image, image, valid, valid))
-    assert len(found.centre) == len(found.move) == len(found.z) == 0
