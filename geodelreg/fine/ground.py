@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from geodelreg.values.raster import BoolArray, FloatArray, IntArray
 _CORE_SIGMAS = 3.0
 _CORE_FLOOR_PX = 0.05
 """Of a rigid ground: what interpolation and unlike point spreads leave, coarser pixels."""
+_ALL_BUT_STRAYS = 0.8  # of what is far off: banks of clouds leave half to others, tears nine tenths
 ANOTHER_PX = 1.5
 """From which a motion is another one: dense matching reaches so far, and follows what is nearer."""
 
@@ -89,7 +90,8 @@ def other_motion(
 ) -> Motion | None:
     """The largest motion besides the ground's, if so many share it that no result may ignore it.
 
-    Of a part that is cut off fewer do: clouds are not cut off by lines.
+    Of a part that is torn off fewer do, and it is no cloud, however bright: a line cuts it off, and
+    hardly anything else moves.
 
     Strips one patch wide are no layer, for most of their neighbours are the ground's; they count
     when they agree, and no other patches lie among them.
@@ -113,23 +115,23 @@ def other_motion(
     Motion or None
     """
     some, many = (max(share * textured, LEAST_PATCHES) for share in (TORN_SHARE, LEAST_SHARE))
+    ground, far = label == 0, np.hypot(*move.T) > ANOTHER_PX
 
-    def matters(member: BoolArray) -> bool:
-        count, ground = member.sum(), label == 0
-        return bool(count >= many or (count >= some and is_cut_off(source, member, ground)))
+    def judged(motion: Motion) -> Motion | None:
+        count = int(motion.member.sum())
+        torn = count >= _ALL_BUT_STRAYS * far.sum() and is_cut_off(source, motion.member, ground)
+        return replace(motion, is_torn=torn) if count >= (some if torn else many) else None
 
     found = []
     for number in range(1, int(label.max(initial=0)) + 1):
         member = label == number
-        centre = np.median(move[member], axis=0)
-        if not np.hypot(*centre) > ANOTHER_PX or not matters(member):
+        layer = judged(Motion(member, np.median(move[member], axis=0)))
+        if layer is None or not np.hypot(*layer.move) > ANOTHER_PX:
             continue
-        both = member | (label == 0)
-        cut_off = is_cut_off(source, member, label == 0)
-        if cut_off or not cloud_look(source[both], member[both], brightest[both]).explains:
-            found.append(Motion(member, centre))
-    strays = (label < 0) & (np.hypot(*move.T) > ANOTHER_PX)
-    strip = second_motion(move, strays, ANOTHER_PX, reach_px)
-    if strip is not None and matters(strip.member) and is_solid(source, strip.member, label == 0):
-        found.append(strip)
+        both = member | ground
+        if layer.is_torn or not cloud_look(source[both], member[both], brightest[both]).explains:
+            found.append(layer)
+    strip = second_motion(move, (label < 0) & far, ANOTHER_PX, reach_px)
+    if strip is not None and is_solid(source, strip.member, ground):
+        found += filter(None, [judged(strip)])
     return max(found, key=lambda motion: int(motion.member.sum()), default=None)

@@ -125,10 +125,13 @@ class Motion:
     member : (N,) bool
     move : (2,) float64
         Mean displacement of the members against the ground, in the pixels given.
+    is_torn : bool
+        A line cuts them off, and hardly anything else moves.
     """
 
     member: BoolArray
     move: FloatArray
+    is_torn: bool = False
 
 
 def second_motion(

@@ -39,11 +39,11 @@ _GRIDS = (
 
 
 class Moved(NamedTuple):
-    """Another motion: share of the textured patches, where they lie, if a line cuts them off."""
+    """Another motion: share of the textured patches, where they lie, if they are torn off."""
 
     share: float = 0.0
     words: str = ""
-    is_cut_off: bool = False
+    is_torn: bool = False
 
 
 NOTHING_MOVES = Moved()
@@ -76,7 +76,7 @@ def small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> Moved
             continue
         ground = ground_of(places, index)
         moved = another_motion(refined, places, index, ground, to_full)
-        if moved.share and (moved.is_cut_off or ground.look.outshining < OUTSHINING):
+        if moved.share and (moved.is_torn or ground.look.outshining < OUTSHINING):
             return moved
     return NOTHING_MOVES
 
@@ -138,9 +138,8 @@ def another_motion(
     motion = other_motion(at, apart, ground.label, bright, textured, REACH_PX)
     if motion is None:
         return NOTHING_MOVES
-    cut_off = is_cut_off(at, motion.member, ground.label == 0)
     moved = _told(refined, places, index, motion.member, motion.move, to_full)
-    return moved._replace(is_cut_off=cut_off)
+    return moved._replace(is_torn=motion.is_torn)
 
 
 def _told(
