@@ -192,7 +192,7 @@ def test_relief_is_not_passed_over_in_silence(tmp_path: Path) -> None:
 
 
 def test_as_many_keypoints_are_taken_as_are_allowed(tmp_path: Path) -> None:
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((500, 500)), 1.0)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((400, 400)), 1.0)
     data = (2000 + 3000 * noise).astype(np.uint16)[None]
     crs = CRS.from_epsg(32616).to_wkt()
     place = Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 1_000_000.0)
@@ -200,6 +200,6 @@ def test_as_many_keypoints_are_taken_as_are_allowed(tmp_path: Path) -> None:
     pan = write(tmp_path / "pan.tif", data, Affine.translation(4.0, -6.0) @ place, crs)
     counts = [
         align(ms, pan, AlignOptions(max_keypoints=most)).solution.step_counts["keypoints PAN"]
-        for most in (1000, 6000, 9000)
+        for most in (1000, 6000)
     ]
-    assert counts == [1000, 1500, 2250]
+    assert counts == [1000, 1500]

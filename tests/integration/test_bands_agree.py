@@ -14,7 +14,7 @@ from benchmarks.scenes.make import HeaderError, SceneSpec, make_scene, write_sce
 from geodelreg import AlignOptions
 from geodelreg.errors import AlignmentRefusedError, BandNumberError, UsageError
 
-SPEC = SceneSpec("agree", "", HeaderError((2.3, -1.7)), (800, 800), (180, 180), ratio=4.0)
+SPEC = SceneSpec("agree", "", HeaderError((2.3, -1.7)), (560, 560), (126, 126), ratio=4.0)
 STILL = (0.0, 0.0)
 
 
