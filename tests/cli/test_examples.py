@@ -24,11 +24,10 @@ from tests.cli.examples import ROOT, examples, pages, run_examples
 from tests.cli.helpers import SAMPLES, SIDE, copy_corner, copy_samples
 
 
-def pixels(name: str, side: int | None = None) -> NDArray[Any]:
-    """All bands of a sample, or of its upper left corner."""
-    window = None if side is None else Window(0, 0, side, side)
+def pixels(name: str) -> NDArray[Any]:
+    """All bands of the upper left corner of a sample."""
     with rasterio.open(SAMPLES / name) as dataset:
-        return np.asarray(dataset.read(window=window))
+        return np.asarray(dataset.read(window=Window(0, 0, SIDE[name], SIDE[name])))
 
 
 def write_as(path: Path, model: str, data: NDArray[Any], **profile: Any) -> None:
@@ -41,11 +40,6 @@ def write_as(path: Path, model: str, data: NDArray[Any], **profile: Any) -> None
         path, "w", **({"driver": "GTiff", "dtype": data.dtype} | kept | shape | profile)
     ) as dataset:
         dataset.write(data)
-
-
-def whole(folder: Path) -> None:
-    """ms.tif and pan.tif: the sample pair."""
-    copy_samples(folder)
 
 
 def free_port() -> int:
@@ -85,14 +79,14 @@ def landsat(folder: Path) -> None:
     for number, band in enumerate(pixels("ms.tif")[:3], start=2):
         write_as(Path(f"{scene}_B{number}.TIF"), "ms.tif", band[None])
     write_as(Path(f"{scene}_B8.TIF"), "pan.tif", pixels("pan.tif"))
-    clear = np.full((1, 200, 200), 21824, dtype=np.uint16)
-    clear[:, :40] = 22280
+    clear = np.full((1, 100, 100), 21824, dtype=np.uint16)
+    clear[:, :20] = 22280
     write_as(Path(f"{scene}_QA_PIXEL.TIF"), "ms.tif", clear)
 
 
 def landsat_is_sharp(folder: Path) -> None:
     with rasterio.open(folder / "sharp.tif") as dataset:
-        assert (dataset.count, dataset.shape) == (3, (800, 800))
+        assert (dataset.count, dataset.shape) == (3, (400, 400))
         assert "landsat-qa" in dataset.tags()["GEODELREG_MASKS"]
     assert is_aligned(folder / "sharp.tif", SAMPLES / "pan.tif")
 
@@ -106,7 +100,7 @@ def sentinel2(folder: Path) -> None:
 def sentinel2_is_sharp(folder: Path) -> None:
     assert is_aligned(folder / "bands_20m_aligned.tif", folder / "bands_10m.tif", 4)
     with rasterio.open(folder / "bands_20m_sharp.tif") as dataset:
-        assert (dataset.count, dataset.shape) == (4, (800, 800))
+        assert (dataset.count, dataset.shape) == (4, (400, 400))
 
 
 def worldview(folder: Path) -> None:
@@ -120,9 +114,9 @@ def keeps_eleven_bits(folder: Path) -> None:
 
 
 def framed(folder: Path) -> None:
-    whole(folder)
+    copy_corner(folder)
     data = pixels("ms.tif")
-    data[:, :, :50] = 0
+    data[:, :, :25] = 0
     write_as(folder / "framed.tif", "ms.tif", data)
 
 
@@ -138,7 +132,7 @@ def clouds(folder: Path) -> None:
     qa = "LC08_L2SP_016035_20210608_20210615_02_T1_QA_PIXEL.TIF"
     write_as(folder / qa, "ms.tif", clear)
     lossless = {"driver": "JP2OpenJPEG", "QUALITY": 100, "REVERSIBLE": "YES"}
-    for name, band in zip(("B02.jp2", "B03.jp2", "B04.jp2"), pixels("ms.tif", 100), strict=False):
+    for name, band in zip(("B02.jp2", "B03.jp2", "B04.jp2"), pixels("ms.tif"), strict=False):
         write_as(folder / name, "ms.tif", band[None], **lossless)
     masks(folder, ["T18SUF_20210608T155819_SCL_20m.jp2", "classes.tif"], 9, 4)
     masks(folder, ["ms_clouds.tif"], 1, 0)
@@ -147,7 +141,7 @@ def clouds(folder: Path) -> None:
 
 def band_files(folder: Path) -> None:
     copy_corner(folder)
-    for name, band in zip(("B2", "B3", "B4", "B8A"), pixels("ms.tif", 100), strict=True):
+    for name, band in zip(("B2", "B3", "B4", "B8A"), pixels("ms.tif"), strict=True):
         write_as(folder / f"{name}.tif", "ms.tif", band[None])
     (folder / "pan.tif").rename(folder / "B8.tif")
 
@@ -155,7 +149,7 @@ def band_files(folder: Path) -> None:
 def scene_of_several_files(folder: Path) -> None:
     copy_corner(folder)
     masks(folder, ["mask.tif"], 1, 0)
-    write_as(folder / "B05.tif", "ms.tif", pixels("ms.tif", 50))
+    write_as(folder / "B05.tif", "ms.tif", pixels("ms.tif")[:, :50, :50])
     write_lakes(folder / "fields.geojson")
 
 
@@ -211,7 +205,7 @@ PAGES: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "docs/how-to/apply.md": (scene_of_several_files, nothing),
     "docs/how-to/band-files.md": (band_files, bands_are_aligned),
     "docs/how-to/bent.md": (copy_corner, spline_is_aligned),
-    "docs/how-to/check.md": (whole, nothing),
+    "docs/how-to/check.md": (copy_samples, nothing),
     "docs/how-to/clouds.md": (clouds, nothing),
     "docs/how-to/in-place.md": (copy_corner, header_is_back),
     "docs/how-to/no-data.md": (framed, frame_is_no_data),
