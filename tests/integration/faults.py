@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -73,16 +74,33 @@ def run_with_error(work: Callable[[], object], at: int, number: int = errno.ENOS
 
 
 def run_killed(work: Callable[[], object], at: int, partly: bool) -> bool:
-    """Run in a child process that is killed at its `at`-th call; True when it was."""
-    child = os.fork()
-    if child == 0:
-        try:
-            with injected(Fault(at, lambda: os.kill(os.getpid(), signal.SIGKILL), partly)):
-                work()
-        finally:
-            os._exit(0)
-    _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status)
+    """Run in a child process that is killed at its `at`-th call; True when it was.
+
+    `work` is pickled: the child is not forked from the process of the tests, which has grown so
+    large that copying its page tables takes longer than the work.
+    """
+    child = _SMALL.Process(target=_run_to_be_killed, args=(work, at, partly))
+    child.start()
+    child.join()
+    assert child.exitcode in (0, -signal.SIGKILL)
+    return child.exitcode == -signal.SIGKILL
+
+
+_SMALL = get_context("forkserver")
+_SMALL.set_forkserver_preload(
+    [
+        f"tests.integration.test_{name}"
+        for name in ("atomic", "inplace", "private_folder", "together")
+    ]
+)
+
+
+def _run_to_be_killed(work: Callable[[], object], at: int, partly: bool) -> None:
+    try:
+        with injected(Fault(at, lambda: os.kill(os.getpid(), signal.SIGKILL), partly)):
+            work()
+    finally:
+        os._exit(0)
 
 
 def run_as_ordinary_user(work: Callable[[], object]) -> bool:

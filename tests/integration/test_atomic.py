@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -291,7 +292,7 @@ def test_kill_at_every_call_is_finished_or_undone_by_the_next_run(
 ) -> None:
     step = 1
     restore(tmp_path, OLD)
-    while run_killed(lambda: write_three(tmp_path), step, partly):
+    while run_killed(partial(write_three, tmp_path), step, partly):
         left = contents(tmp_path)
         assert left["out.tif"] in (OLD["out.tif"], NEW["out.tif"])
         if left["out.tif"] == NEW["out.tif"]:
@@ -313,9 +314,9 @@ def test_kill_at_every_call_of_a_raster_copy(tmp_path: Path) -> None:
     source, out = make_tiff(tmp_path / "ms.tif"), tmp_path / "out.tif"
     correction = correction_of(source)
 
-    def work() -> None:
-        write_corrected(source, out, correction, GCPS, TAGS, WriteOptions(overwrite=True))
-
+    work = partial(
+        write_corrected, source, out, correction, GCPS, TAGS, WriteOptions(overwrite=True)
+    )
     step = 1
     while run_killed(work, step, partly=True):
         if out.exists():

@@ -14,6 +14,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -429,7 +430,7 @@ def test_kill_within_every_call_leaves_old_or_new(memory_folder: Path, kind: str
     restore(memory_folder, before)
 
     step, seen = 1, set()
-    while run_killed(lambda: edit_in_place(raster, correction, GCPS, TAGS), step, partly=True):
+    while run_killed(partial(edit_in_place, raster, correction, GCPS, TAGS), step, partly=True):
         seen.add(georeferencing_of(raster))
         assert encoded_blocks(raster) == blocks
         edit_in_place(raster, correction, GCPS, TAGS)
@@ -442,7 +443,7 @@ def test_kill_within_every_call_leaves_old_or_new(memory_folder: Path, kind: str
 
     restore(memory_folder, edited)
     step, seen = 1, set()
-    while run_killed(lambda: revert(raster), step, partly=True):
+    while run_killed(partial(revert, raster), step, partly=True):
         seen.add(georeferencing_of(raster))
         assert encoded_blocks(raster) == blocks
         if (memory_folder / f"ms.tif{UNDO}").exists():

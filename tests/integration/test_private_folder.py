@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -334,16 +335,17 @@ def test_owner_that_cannot_be_kept_is_named_and_no_group_gains_by_it() -> None:
         assert (out.stat().st_uid, out.stat().st_mode & 0o777) == (65534, 0o622)
 
 
-def test_kill_leaves_no_folder_that_a_later_run_refuses(tmp_path: Path) -> None:
-    def write() -> None:
-        with staged(tmp_path / "x.bil", overwrite=True) as work:
-            work.write_bytes(b"new")
-            work.with_name("x.hdr").write_bytes(b"new header")
-            work.with_name("x.bil.aux.xml").write_bytes(b"new statistics")
+def write_with_side_files(folder: Path) -> None:
+    with staged(folder / "x.bil", overwrite=True) as work:
+        work.write_bytes(b"new")
+        work.with_name("x.hdr").write_bytes(b"new header")
+        work.with_name("x.bil.aux.xml").write_bytes(b"new statistics")
 
+
+def test_kill_leaves_no_folder_that_a_later_run_refuses(tmp_path: Path) -> None:
     step = 1
-    while run_killed(write, step, partly=True):
-        write()
+    while run_killed(partial(write_with_side_files, tmp_path), step, partly=True):
+        write_with_side_files(tmp_path)
         assert set(contents(tmp_path).values()) == {b"new", b"new header", b"new statistics"}
         assert names(tmp_path) == {"x.bil", "x.hdr", "x.bil.aux.xml"}
         step += 1

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -203,7 +204,7 @@ def test_kill_at_every_call_is_settled_by_the_next_run_on_any_of_them(
 ) -> None:
     step, seen = 1, set()
     restore(folder, OLD)
-    while run_killed(lambda: write_three(folder), step, partly):
+    while run_killed(partial(write_three, folder), step, partly):
         touch_each(folder, place)
         left = contents(folder)
         if any(name.startswith(".") for name in names(folder)):
@@ -227,9 +228,9 @@ def test_kill_while_an_interrupted_run_is_settled(folder: Path) -> None:
         second = 1
         while True:
             restore(folder, OLD)
-            if not run_killed(lambda: write_three(folder), first, True):
+            if not run_killed(partial(write_three, folder), first, True):
                 return
-            if not run_killed(lambda: touch_each(folder, "b.txt"), second, True):
+            if not run_killed(partial(touch_each, folder, "b.txt"), second, True):
                 break
             for other in ("c.txt", "b.txt", "a.txt"):
                 touch_each(folder, other)
@@ -242,7 +243,7 @@ def test_kill_while_an_interrupted_run_is_settled(folder: Path) -> None:
 def test_a_settled_run_is_named(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     step, told = 1, set()
     restore(folder, OLD)
-    while run_killed(lambda: write_three(folder), step, True):
+    while run_killed(partial(write_three, folder), step, True):
         caplog.clear()
         touch_each(folder, "b.txt")
         for record in caplog.records:
@@ -256,17 +257,17 @@ def test_a_settled_run_is_named(folder: Path, caplog: pytest.LogCaptureFixture) 
     assert told == {"finishing", "taking back"}
 
 
+def write_into_several_folders(folder: Path) -> None:
+    with together():
+        for name in ("one/x", "two/y", "z"):
+            write_text_atomically(folder / name, name, overwrite=True)
+
+
 def test_files_in_several_folders(folder: Path) -> None:
     (folder / "one").mkdir()
     (folder / "two").mkdir()
-
-    def work() -> None:
-        with together():
-            for name in ("one/x", "two/y", "z"):
-                write_text_atomically(folder / name, name, overwrite=True)
-
     step = 1
-    while run_killed(work, step, True):
+    while run_killed(partial(write_into_several_folders, folder), step, True):
         tidy([folder / "two" / "y"])
         tidy([folder / "one" / "x", folder / "z"])
         assert set(everything(folder)) in (set(), {"one/x", "two/y", "z"})
@@ -371,7 +372,7 @@ def test_kill_within_every_call_is_settled_by_the_next_run_on_any_file(folder: P
     result, before = found_for(paths), contents(folder)
     blocks = [encoded_blocks(path) for path in paths]
     step, seen = 1, set()
-    while run_killed(lambda: geodelreg.write_in_place(result), step, partly=True):
+    while run_killed(partial(geodelreg.write_in_place, result), step, partly=True):
         assert {transform_of(path) for path in paths} <= {TRANSFORM, TRANSFORM @ SHIFT}
         tidy([paths[step % 3]])
         moved = {transform_of(path) for path in paths}
@@ -398,7 +399,7 @@ def test_kill_of_a_second_edit_takes_back_that_one_only(folder: Path) -> None:
     before = contents(folder)
     second = found_for(paths, TRANSFORM @ SHIFT @ SHIFT)
     step, seen = 1, set()
-    while run_killed(lambda: geodelreg.write_in_place(second), step, partly=True):
+    while run_killed(partial(geodelreg.write_in_place, second), step, partly=True):
         tidy([paths[1]])
         tidy(paths)
         moved = {transform_of(path) for path in paths}
@@ -415,7 +416,7 @@ def test_a_raster_that_was_removed_after_the_kill_blocks_nobody(folder: Path) ->
     paths = bands(folder)
     result, before = found_for(paths), contents(folder)
     step = 1
-    while run_killed(lambda: geodelreg.write_in_place(result), step, partly=True):
+    while run_killed(partial(geodelreg.write_in_place, result), step, partly=True):
         paths[1].unlink()
         tidy(paths)
         assert transform_of(paths[0]) == transform_of(paths[2])
@@ -494,7 +495,7 @@ def test_error_at_every_call_leaves_all_copies_or_none(folder: Path, number: int
 def test_kill_within_every_call_leaves_all_copies_or_none_to_the_next_run(folder: Path) -> None:
     paths, out = bands(folder), folder / "out"
     result, step, seen = found_for(paths), 1, set()
-    while run_killed(lambda: geodelreg.write(result, out), step, partly=True):
+    while run_killed(partial(geodelreg.write, result, out), step, partly=True):
         tidy([out / "B2.tif"])
         left = {name for name in BANDS if (out / name).exists()}
         assert left in (set(), set(BANDS))
