@@ -84,8 +84,9 @@ def _drawn(images: Sequence[Sequence[Band]]) -> list[FloatArray]:
     step = max(sum(bands[0].data.size for bands in images) // SAMPLES, 1)
     found = []
     for number in range(len(images[0])):
-        seen = [bands[number].data[bands[number].valid] for bands in images]
-        found.append(drawn_values(np.concatenate(seen)[::step]))
+        every = [(one[number].data.ravel(), one[number].valid.ravel()) for one in images]
+        seen = [data[::step][valid[::step]] for data, valid in every]
+        found.append(drawn_values(np.concatenate(seen)))
     return found
 
 
