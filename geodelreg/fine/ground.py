@@ -41,11 +41,14 @@ class Ground:
         against the correction to be judged.
     moving : float
         Their share.
+    is_torn : bool
+        A line cuts those off from the others.
     """
 
     label: IntArray
     look: CloudLook
     moving: float
+    is_torn: bool
 
     @property
     def member(self) -> BoolArray:
@@ -73,11 +76,13 @@ def find_ground(
     """
     tolerance = max(_CORE_SIGMAS * float(np.sqrt(np.median(variance_px2))), _CORE_FLOOR_PX)
     core = consensus(source, target, tolerance).inliers
-    look, moving = CloudLook(), 0.0
+    look, moves = CloudLook(), ~core
     for still in (core, np.hypot(*(target - source).T) <= tolerance):
         if not look.explains:
-            look, moving = cloud_look(source, ~still, brightest), float((~still).mean())
-    return Ground(layers(source, target - source, np.sqrt(variance_px2)), look, moving)
+            look, moves = cloud_look(source, ~still, brightest), ~still
+    label = layers(source, target - source, np.sqrt(variance_px2))
+    torn = bool(moves.any()) and is_cut_off(source, moves, ~moves)
+    return Ground(label, look, float(moves.mean()), torn)
 
 
 def other_motion(

@@ -219,7 +219,7 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
     whole, gentle = _bent(refined, correction, agreed, observe(part, seen, correction))
     moved = another_motion(refined, places, index, ground, to_full)
     # what a smooth field explains is no cloud, however bright and high above the ground
-    if ground.look.explains and not gentle and not moved.is_torn:
+    if ground.look.explains and not (gentle or moved.is_torn or ground.is_torn):
         return replace(agreed, clouds=ground.moving)
     if not moved.share and len(places.centre) < FEW_PATCHES:
         moved = small_motion(refined, images, to_full)

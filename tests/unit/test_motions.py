@@ -140,6 +140,16 @@ def test_the_ground_between_more_clouds_is_where_the_correction_puts_it() -> Non
     assert ground.moving == pytest.approx(moves.mean(), abs=0.05)
 
 
+@pytest.mark.parametrize("torn", [True, False])
+def test_a_part_that_a_line_cuts_off_is_told_from_bright_patches_here_and_there(torn: bool) -> None:
+    rng, xy = np.random.default_rng(10), lattice(6)
+    moves = xy.sum(axis=1) > 150.0 if torn else rng.random(len(xy)) < 0.4
+    shift = np.where(moves[:, None], (-1.0, 0.4), (0.0, 0.0)) + rng.normal(0, 0.01, xy.shape)
+    ground = find_ground(xy, xy + shift, np.full(len(xy), 1e-4), brightest(moves, 8.0, rng))
+    assert ground.is_torn == torn
+    assert ground.moving == pytest.approx(moves.mean())
+
+
 def test_snowy_hills_look_like_clouds_and_are_one_layer_of_ground() -> None:
     rng, xy = np.random.default_rng(9), lattice()
     gap = xy[:, None] - np.array([(100.0, 90.0), (290.0, 130.0), (120.0, 300.0), (300.0, 310.0)])
