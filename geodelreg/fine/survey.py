@@ -83,20 +83,21 @@ def survey(
     template = _filled(overlay.template, overlay.template_valid)
     surface = _filled(overlay.surface, overlay.surface_valid)
     reach, (height, width) = REACH_PX, template.shape
-    padded, seen = (
-        np.pad(image, reach) for image in (surface, overlay.surface_valid.astype(np.float32))
+    padded = np.pad(surface, reach)
+    template_seen, seen = (
+        _share_of_squares(valid, size)
+        for valid in (overlay.template_valid, np.pad(overlay.surface_valid, reach))
     )
-    seen = np.asarray(cv2.boxFilter(seen, cv2.CV_32F, (size, size), anchor=(0, 0)), np.float32)
     across, down = (
         _starts(length, size, how) for length, how in zip((width, height), grid, strict=True)
     )
 
-    def is_shown(left: int, top: int) -> bool:
-        mine = slice(top, top + size), slice(left, left + size)
-        shown = (overlay.template_valid[mine].mean(), overlay.surface_valid[mine].mean())
-        return bool(min(shown) >= _LEAST_VALID)
-
-    corners = [(left, top) for top in down for left in across if is_shown(left, top)]
+    corners = [
+        (left, top)
+        for top in down
+        for left in across
+        if min(template_seen[top, left], seen[top + reach, left + reach]) >= _LEAST_VALID
+    ]
     patches = np.empty((len(corners), size, size), dtype=np.float32)
     move, score, here = np.empty((len(corners), 2)), *np.empty((2, len(corners)))
     for number, (left, top) in enumerate(corners):
@@ -119,6 +120,15 @@ def survey(
         np.percentile(flat, _BRIGHTEST_PERCENT, axis=1).astype(np.float64),
         size,
     )
+
+
+def _share_of_squares(valid: BoolArray, size: int) -> Float32Array:
+    """(H, W) share of valid pixels in the square that begins at each pixel."""
+    count = cv2.boxFilter(
+        valid.astype(np.float32), cv2.CV_32F, (size, size), anchor=(0, 0), normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
+    )  # fmt: skip
+    return np.asarray(count / size**2, dtype=np.float32)
 
 
 def _starts(length: int, size: int, how: str) -> list[int]:

@@ -7,7 +7,6 @@ matches nothing there is sought as one piece over the whole of the other image.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -34,8 +33,11 @@ SURVEY_SIGMA_PX = 0.05  # by hand: ½ refuses 1 of 36
 _SURE_Z = 3.0
 FEW_PATCHES = 200  # of a twentieth of more, enough lie within it wherever the grid begins
 _GRIDS = (
-    ("flush", "flush"), ("between", "flush"), ("flush", "between"), ("between", "between"),
+    (PATCH_PX, ("flush", "flush")), (PATCH_PX, ("between", "flush")),
+    (PATCH_PX, ("flush", "between")), (PATCH_PX, ("between", "between")),
+    (SMALLEST_PATCH_PX, ("flush", "flush")), (SMALLEST_PATCH_PX, ("between", "between")),
 )  # fmt: skip
+"""Largest patches, and where they begin across and down."""
 
 
 class Moved(NamedTuple):
@@ -68,7 +70,7 @@ def small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> Moved
     another, or of smaller patches.  Of so few patches brightness proves no cloud; a part that is
     bright is left to clouds.
     """
-    for largest_px, grid in product((PATCH_PX, SMALLEST_PATCH_PX), _GRIDS):
+    for largest_px, grid in _GRIDS:
         places = survey(images, grid, largest_px)
         index = np.flatnonzero(placed(places))
         gone = np.hypot(*places.move[index].T) > ANOTHER_PX
