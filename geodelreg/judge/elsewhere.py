@@ -77,8 +77,10 @@ def small_motion(refined: Refinement, images: Overlay, to_full: Affine) -> Moved
         if gone.sum() < LEAST_PATCHES or (~gone).sum() < FEWEST_POINTS:
             continue
         ground = ground_of(places, index)
+        if ground.look.outshining >= OUTSHINING:
+            continue
         moved = another_motion(refined, places, index, ground, to_full)
-        if moved.share and (moved.is_torn or ground.look.outshining < OUTSHINING):
+        if moved.share:
             return moved
     return NOTHING_MOVES
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geodelreg.fine.clouds import HeightParallax, height_parallax
+from geodelreg.fine.clouds import OUTSHINING, HeightParallax, height_parallax
 from geodelreg.fine.layers import CALM_PATCHES, MATCHED
 from geodelreg.fine.least_squares import MAX_MOVE, Matched, MatchOptions
 from geodelreg.fine.matching import match_tiles, observe
@@ -223,7 +223,7 @@ def _surveyed(guess: Guess, refined: Refinement, correction: PixelMap, agreed: W
         return replace(agreed, clouds=ground.moving)
     if not moved.share and len(places.centre) < FEW_PATCHES:
         moved = small_motion(refined, images, to_full)
-    if not moved.share:
+    if not moved.share and ground.look.outshining < OUTSHINING:
         moved = far_motion(refined, images, places, to_full)
     if moved.share or (whole.is_bent(part.pair.options) and not gentle):
         height = _height(refined, correction)
