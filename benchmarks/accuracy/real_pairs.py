@@ -151,7 +151,7 @@ def align_pair(pair: Pair, data: Path) -> Row:
         corrected, points = alignment.correction.corrected, alignment.tie_points
         residual = float(np.median(np.hypot(*points.residual_px[points.kept].T)))
     except GeodelregError as error:
-        verdict, model, corrected = f"{type(error).__name__}: {error}", "none", None
+        verdict, model, corrected = f"{type(error).__name__}: {error.cause}", "none", None
         residual = float("nan")
     seconds = time.perf_counter() - started
     after = measure_pair(pair, data, corrected) if corrected is not None else before
