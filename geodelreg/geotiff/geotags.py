@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from xml.sax.saxutils import escape
+from html import escape  # that of xml.sax loads urllib, and ssl
 
 from affine import Affine
 
@@ -133,11 +133,11 @@ def _items(domains: Mapping[str, Mapping[str, str]], band: str) -> Iterable[byte
         place = f' domain="{_attribute(domain)}"' if domain else ""
         for name, value in sorted(items.items()):
             # GDAL unescapes twice, once as XML and once more
-            text = escape(escape(value))
+            text = escape(escape(value, quote=False), quote=False)
             yield f'  <Item name="{_attribute(name)}"{band}{place}>{text}</Item>\n'.encode(
                 errors="replace"
             )
 
 
 def _attribute(text: str) -> str:
-    return escape(text, {'"': "&quot;"})
+    return escape(text, quote=False).replace('"', "&quot;")

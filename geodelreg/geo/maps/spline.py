@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from geodelreg.values.raster import FloatArray
 
@@ -57,6 +56,8 @@ def by_polynomial(asked: Values, shape: tuple[int, int], tolerance_px: float) ->
     asked, shape, tolerance_px
         As for `interpolated`.
     """
+    from numpy.polynomial.chebyshev import chebpts1, chebvander
+
     height, width = shape
     nodes, tried = (chebpts1(_DEGREE + n) for n in (1, 2))
 
