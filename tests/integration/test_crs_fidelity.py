@@ -168,14 +168,15 @@ Herd = dict[str, tuple[Path, Said]]
 
 @pytest.fixture(scope="module")
 def herds(tmp_path_factory: pytest.TempPathFactory) -> dict[Container, Herd]:
-    """Every CRS in every container, with what GDAL reads there; never written to."""
+    """Every CRS in PAM, the difficult ones in all, with what GDAL reads there; never written to."""
     made: dict[Container, Herd] = {}
     for container in (in_tiff, in_pam, in_vrt):
         herd: Herd = {}
         for name, (wkt, attributes) in zoo().items():
-            path = container(tmp_path_factory.mktemp("herd"), wkt, attributes)
-            herd[name] = path, Said.of(path)
-            assert herd[name][1].wkt, name
+            if container is in_pam or DIFFICULT.search(name):
+                path = container(tmp_path_factory.mktemp("herd"), wkt, attributes)
+                herd[name] = path, Said.of(path)
+                assert herd[name][1].wkt, name
         made[container] = herd
     return made
 
@@ -201,20 +202,19 @@ def unfaithful(folder: Path, way: Way, herd: Herd) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("container", [in_tiff, in_pam, in_vrt])
-def test_every_crs_survives_the_copy(
-    herds: dict[Container, Herd], tmp_path: Path, container: Container
-) -> None:
-    assert len(herds[container]) > 150
-    assert unfaithful(tmp_path, to_tiff, herds[container]) == {}
+def test_every_crs_survives_the_copy(herds: dict[Container, Herd], tmp_path: Path) -> None:
+    assert len(herds[in_pam]) > 150
+    assert unfaithful(tmp_path, to_tiff, herds[in_pam]) == {}
 
 
 @pytest.mark.parametrize(
     ("container", "way"),
     [
+        # keys are left, made anew beside them, or all written by GDAL: what writes any other
+        # format reads the CRS in one way, whatever holds it
         *((in_pam, way) for way in (to_deflate, to_cog, to_vrt, to_png, in_place, warped, by_gcps)),
-        *((in_tiff, way) for way in (to_deflate, to_vrt, in_place, warped)),
-        *((in_vrt, way) for way in (to_deflate, to_vrt, to_png, warped)),
+        *((in_tiff, way) for way in (to_tiff, to_vrt, in_place)),
+        *((in_vrt, way) for way in (to_tiff, to_vrt)),
     ],
 )
 def test_difficult_crs_survives_or_is_refused(
@@ -223,6 +223,8 @@ def test_difficult_crs_survives_or_is_refused(
     herd = {name: animal for name, animal in herds[container].items() if DIFFICULT.search(name)}
     found = unfaithful(tmp_path, way, herd)
     assert [what for what in found.values() if not what.startswith("refused")] == []
+    if way is to_tiff:
+        assert found == {}
     # GDAL has no place for the epoch of GCPs, and reads meridians in grads out of keys so that no
     # other file says the same
     excusable = "2021" if way is by_gcps else "NTF|paris"
