@@ -92,48 +92,35 @@ def ask_bands(
     ground = last.matched.template_px[last.status == Status.KEPT]
     patches = BandPatches(part, refined.tiles, ground, correction, refined.size)
     glance = patches.glance()
-    if glance is not None and _lie_together(glance, part.pair, told_px):
-        return BandsApart(), _furthest(glance, part.pair)
+    if glance is None:
+        return bands_apart(find_bands(guess, refined, correction, pool), part.pair), BandsApart()
+    nearby = _furthest(glance, part.pair)
+    # one step is right of small offsets, and what would be told is looked at closely
+    widest = max((np.hypot(*glance.gap(*two)[0]) for two in _pairs(glance, part.pair)), default=0.0)
+    right = bool(widest <= _NEAR_PX and nearby.distance_px <= told_px)
+    if right and glance.unexplained.max() < _ALIKE:
+        return BandsApart(), nearby
     found = find_bands(guess, refined, correction, pool)
-    told = BandsApart()
-    if glance is not None:
-        told = _ground_apart(patches, glance, found, part.pair, told_px)
-    return bands_apart(found, part.pair), told
-
-
-def _lie_together(glance: BandOffsets, pair: Pair, told_px: float) -> bool:
-    """True of bands that one step, which is right of small offsets only, finds in their place."""
-    return bool(glance.unexplained.max() < _ALIKE and _is_right(glance, pair, told_px))
-
-
-def _is_right(glance: BandOffsets, pair: Pair, told_px: float) -> bool:
-    """True when no gap is longer than what one step tells, nor one that would be told."""
-    widest = max((np.hypot(*glance.gap(*two)[0]) for two in _pairs(glance, pair)), default=0.0)
-    return bool(widest <= _NEAR_PX and _furthest(glance, pair).distance_px <= told_px)
+    elsewhere = next(_gaps(found, part.pair), None)
+    starts = [np.zeros_like(glance.offset_px)]
+    if elsewhere is not None and elsewhere.sure_px > told_px:
+        starts.append(_by_pan(found, part.pair))
+    if len(starts) > 1 or not right:
+        nearby = _ground_apart(patches, glance, starts, part.pair)
+    return bands_apart(found, part.pair), nearby
 
 
 def _ground_apart(
-    patches: BandPatches,
-    glance: BandOffsets,
-    found: Sequence[BandPass],
-    pair: Pair,
-    told_px: float,
+    patches: BandPatches, glance: BandOffsets, starts: Sequence[FloatArray], pair: Pair
 ) -> BandsApart:
     """How far apart the bands put the ground alone: each band matched on all other bands.
 
     A band that only looks unlike PAN, as near infrared over a coast does, matches it at another
     place than its own; among bands, what it shows alone widens its standard error.
     """
-    known, starts = glance, [np.zeros_like(glance.offset_px)]
-    furthest = next(_gaps(found, pair), None)
-    if furthest is not None and furthest.sure_px > told_px:
-        starts.append(_by_pan(found, pair))
-    if len(starts) > 1 or not _is_right(glance, pair, told_px):
-        sought = [offsets for start in starts if (offsets := patches.measure(start)) is not None]
-        # a band at a place that is not its own is explained worse
-        known = min(
-            sought, key=lambda one: float(np.log(one.unexplained + TINY).sum()), default=known
-        )
+    sought = [offsets for start in starts if (offsets := patches.measure(start)) is not None]
+    # a band at a place that is not its own is explained worse
+    known = min(sought, key=lambda one: float(np.log(one.unexplained + TINY).sum()), default=glance)
     return _furthest(known, pair)
 
 

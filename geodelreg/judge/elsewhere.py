@@ -16,7 +16,7 @@ from geodelreg.coarse.correlation import AMBIGUOUS, best_shift
 from geodelreg.fine.clouds import OUTSHINING
 from geodelreg.fine.ground import ANOTHER_PX, Ground, find_ground, other_motion
 from geodelreg.fine.least_squares import MAX_MOVE
-from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE, is_cut_off
+from geodelreg.fine.motions import LEAST_PATCHES, LEAST_SHARE, Motion, is_cut_off
 from geodelreg.fine.overlay import Overlay, overlay
 from geodelreg.fine.passes import Refinement
 from geodelreg.fine.survey import REACH_PX, Places, survey
@@ -26,7 +26,7 @@ from geodelreg.judge.evidence import decimated
 from geodelreg.judge.words import lies, region
 from geodelreg.values.maps import PixelMap
 from geodelreg.values.points import Guess
-from geodelreg.values.raster import BoolArray, FloatArray, IntArray
+from geodelreg.values.raster import BoolArray, IntArray
 
 _PLACED_SCORE = 0.5
 SURVEY_SIGMA_PX = 0.05  # by hand: ½ refuses 1 of 36
@@ -102,7 +102,8 @@ def far_motion(refined: Refinement, images: Overlay, places: Places, to_full: Af
     found = best_shift(piece)
     if found.rival > AMBIGUOUS or not np.hypot(*found.move) > ANOTHER_PX:
         return NOTHING_MOVES
-    return _told(refined, places, places.textured, astray[places.textured], found.move, to_full)
+    motion = Motion(astray[places.textured], found.move, is_torn=True)
+    return _told(refined, places, places.textured, motion, to_full)
 
 
 def ground_of(places: Places, index: IntArray) -> Ground:
@@ -142,22 +143,21 @@ def another_motion(
     motion = other_motion(at, apart, ground.label, bright, textured, REACH_PX)
     if motion is None:
         return NOTHING_MOVES
-    moved = _told(refined, places, index, motion.member, motion.move, to_full)
-    return moved._replace(is_torn=motion.is_torn)
+    return _told(refined, places, index, motion, to_full)
 
 
 def _told(
     refined: Refinement,
     places: Places,
     among: IntArray | BoolArray,
-    member: BoolArray,
-    move: FloatArray,
+    motion: Motion,
     to_full: Affine,
 ) -> Moved:
-    """What is said of members among some of the patches, (2,) pixels of the overlay off."""
+    """What is said of a motion of some of the patches, in pixels of the overlay."""
     part = refined.part
     size = places.centre.max(axis=0) + places.centre.min(axis=0)
-    step = move * unit_of(to_full) * part.pan_px_per_patch_px / part.step
+    step = motion.move * unit_of(to_full) * part.pan_px_per_patch_px / part.step
     place = lies(-step if part.ms_is_template else step)
-    share = float(member.sum()) / int(places.textured.sum())
-    return Moved(share, f"{region(places.centre[among], member, size)} {place}", True)
+    share = float(motion.member.sum()) / int(places.textured.sum())
+    where = region(places.centre[among], motion.member, size)
+    return Moved(share, f"{where} {place}", motion.is_torn)
